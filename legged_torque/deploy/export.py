@@ -30,8 +30,8 @@ from legged_torque.deploy.description import (
 from legged_torque.deploy.policy import OBSERVATIONS, Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.motors.ideal import IdealMotor
 from legged_torque.motors.motor import Motor
+from legged_torque.motors.twin import MotorTwin
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError, refuse
@@ -39,6 +39,7 @@ from legged_torque.utils.files import write_errors
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
+NUM_SUBSTEPS = 3  # physics steps in which motors that remember are compared
 NUM_SAMPLES = 256  # random observations on which the exported networks are compared
 INITIAL_STATE = {
     "trunk_place": "init_place",
@@ -116,8 +117,8 @@ def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
 
 def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
     """Return a line for each part of a task that only the task can compute, apart from observations."""
-    motors = [name for name, motor in task.motors.links.items() if type(motor) is not IdealMotor]
-    silent = [name for name in motors if type(task.motors.links[name]).describe is Motor.describe]  # may do anything
+    links = task.motors.links.items()
+    silent = [name for name, motor in links if type(motor).describe is Motor.describe]  # they may do anything
     return parts_without_function(description) + [f"the motor '{name}' has no describe()" for name in silent]
 
 
@@ -289,8 +290,10 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
     task.set_state(qpos, draw(task.sim.qvel, 3.0))
     supplied = [term for term in (*task.observations.terms, *task.observations.groups.values()) if not term.privileged]
     values = {term.name: term.value().cpu().clone().numpy() for term in supplied}  # as observed, before torques change
-    wanted = task._compute_torques(task.actions)
-    task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, 0))
+    wanted = task._compute_torques(task.actions).clone()
+    task.motors.reset(task.reset_buf)
+    for substep in range(NUM_SUBSTEPS):
+        task.torques.copy_(task.motors.apply(wanted, task.dof_pos, task.dof_vel, substep))
     parts = (task.base_ang_vel, task.dof_pos, task.dof_vel, task.projected_gravity, task.base_pos, task.base_quat)
     obs, torques = [], []
     for world in range(task.num_envs):
@@ -303,7 +306,8 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
         policy.reset()
         policy.last_action = actions = task.actions[world].cpu().numpy()
         obs.append(policy.observation(state, task.commands[world].cpu().numpy()))
-        torques.append(policy.torques(actions, state.joint_positions, state.joint_velocities))
+        motors, asked = MotorTwin(policy.description), policy.wanted_torques(actions, angles, speeds)
+        torques.append([motors.apply(asked, angles, speeds) for _ in range(NUM_SUBSTEPS)][-1])
     seen, expected = np.array(obs), torch.cat([task.obs_buf[name] for name in model.obs_groups], dim=1).cpu().numpy()
     is_scan = np.array(columns(policy.description["observations"])) == "height_scan"
     compared = [

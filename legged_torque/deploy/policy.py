@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from legged_torque.deploy.description import interface, read, require
+from legged_torque.motors.twin import without_function
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
 
@@ -132,15 +133,22 @@ class Policy:
     def torques(self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray) -> np.ndarray:
         """Return joint torques [N m] for actions of :meth:`act`, clipped to the limits. Shape: (joints,).
 
-        Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
+        Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
+        ``policy.yaml`` are left out: a robot has them. Gains of a ``drive`` among them must be sent to the drives.
         """
+        return np.clip(self.wanted_torques(actions, joint_positions, joint_velocities), *self.torque_limits)
+
+    def wanted_torques(
+        self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray
+    ) -> np.ndarray:
+        """Return what the control law asks the motors for [N m]; arguments as of :meth:`torques`. Shape: (joints,)."""
         actions = np.asarray(actions, np.float32).reshape(len(self._action_terms), len(self.joint_order))
         positions, velocities = self.joints(joint_positions), self.joints(joint_velocities)
         total = np.zeros_like(self.nominal_pose)
         for i, term in enumerate(self._action_terms):
             torques = ACTIONS[term["name"]](self, np.float32(term["scale"]) * actions[i], positions, velocities)
             total += np.float32(term["mixing_weight"]) * torques
-        return np.clip(total, *self.torque_limits)
+        return total
 
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
         """Return x and y of the points of the height scan in the world, in which the trunk has a pose [m].
@@ -203,13 +211,14 @@ ACTIONS: dict[str, Callable[[Policy, np.ndarray, np.ndarray, np.ndarray], np.nda
 
 
 def parts_without_function(description: dict[str, Any]) -> list[str]:
-    """Return a line for each action term or motor of a description that has no function here; no motor has one."""
+    """Return a line for each action term or motor of a description that has no function here."""
     terms = [
         f"no numpy function for the action term '{term['name']}'; there are {', '.join(ACTIONS)}"
         for term in description["actions"]["terms"]
         if term["name"] not in ACTIONS
     ]
-    return terms + [f"no numpy function for the motor '{name}'" for name in description.get("motors", {})]
+    motors = [name for name, described in description.get("motors", {}).items() if without_function(described)]
+    return terms + [f"no numpy function for the motor '{name}'" for name in motors]
 
 
 def load_network(file: Path, description: dict[str, Any]) -> Any:

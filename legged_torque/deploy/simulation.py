@@ -12,6 +12,7 @@ import numpy as np
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
+from legged_torque.motors.twin import MotorTwin
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.heading import heading
 from legged_torque.utils.metrics import NUM_SUMS, step_sums
@@ -52,6 +53,7 @@ class Simulation:
             why = "for which there is no numpy function here; a file of the task's (--task_file) may add it"
             raise UserError(f"plain MuJoCo has no values of {', '.join(policy.supplied)}, {why}")
         self.policy, self.robot = policy, robot
+        self._motors = MotorTwin(policy.description)
         self._push_velocity, self._push_probability = push_velocity, push_probability
         description = policy.description
         self._timing, self._start = description["timing"], description["initial_state"]
@@ -103,10 +105,12 @@ class Simulation:
         self._heights.append(robot.position[2] - robot.ground_heights(places))
         state.heights = self._heights[0]  # the oldest, of this episode
         actions = policy.act(policy.observation(state, self.command))
+        self._motors.begin()
         for i in range(self._timing["decimation"]):
+            pos, vel = robot.joint_positions(), robot.joint_velocities()
             if i == 0 or self._timing["refresh_torques"]:
-                torques = policy.torques(actions, robot.joint_positions(), robot.joint_velocities())
-            robot.step(torques)
+                wanted = policy.wanted_torques(actions, pos, vel)
+            robot.step(self._motors.apply(wanted, pos, vel))
         self._steps += 1
 
     def _finish_step(self, command: np.ndarray) -> np.ndarray:
@@ -145,6 +149,7 @@ class Simulation:
             position[:2] += self._drawn(start["trunk_place"], 2)
         self.robot.reset(position, quaternion(*angles), pose, velocities)
         self.policy.reset()
+        self._motors.reset()
         self._draw_command()
         self._heights.clear()
         self._steps = 0

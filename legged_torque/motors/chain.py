@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import torch
@@ -37,7 +38,8 @@ class MotorChain:
                 raise unknown_name("motors.chain", name, known)
             if name in self.links:
                 raise UserError(f"motors.chain has the link '{name}' twice; give the second one a section of its own")
-            self.links[name] = getattr(settings, name).build(joints)
+            own = dataclasses.replace(joints, section=f"motors.{name}")
+            self.links[name] = getattr(settings, name).build(own)
         self._of_actions, self._of_torques = (
             [link for link in self.links.values() if link.acts_on == kind] for kind in ("actions", "torques")
         )
@@ -91,9 +93,10 @@ class MotorChain:
         return [parameter for link in self.links.values() for parameter in link.random_parameters()]
 
     def describe(self) -> dict[str, dict[str, Any]]:
-        """Return the constants of all links that do more than limit torques, for ``policy.yaml``."""
+        """Return the constants of all links in their order, for ``policy.yaml``; none if they only limit torques."""
         described = {name: link.describe() for name, link in self.links.items()}
-        return {name: constants for name, constants in described.items() if constants}
+        described = {name: constants for name, constants in described.items() if constants}
+        return {} if list(described.values()) == [{"model": "ideal"}] else described
 
     def state_dict(self) -> dict[str, Any]:
         """Return what all links keep from step to step, by name of the link."""

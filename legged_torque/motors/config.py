@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import pkgutil
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from legged_torque.utils.config import Section
+from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Limits
 
 
@@ -31,3 +33,25 @@ class IdealCfg(MotorCfg):
     """Settings of :class:`~legged_torque.motors.ideal.IdealMotor`: any torque within the limits, at once."""
 
     _motor_class = "legged_torque.motors.ideal:IdealMotor"
+
+
+def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
+    """Return a number for each joint: one for all, or by a part of their names, of which the first match counts.
+
+    A UserError, which names the setting, if a joint has no number or a name matches no joint.
+    """
+    if not isinstance(values, dict):
+        return [values] * len(dof_names)
+    for part in values:
+        if not any(part in name for name in dof_names):
+            raise unknown_name(f"joint (part of its name) in {setting}", part, dof_names)
+    taken = []
+    for name in dof_names:
+        matching = [part for part in values if part in name]
+        if not matching:
+            raise UserError(f"{setting} lacks the joint '{name}'; it has {', '.join(values) or 'no entries'}")
+        taken.append(matching[0])
+    for part in values:
+        if part not in taken:
+            raise UserError(f"'{part}' in {setting} has no effect: its joints take a name before it")
+    return [values[part] for part in taken]

@@ -40,3 +40,7 @@ class IdealMotor(Motor):
     def kernel_reads(self) -> Any:
         """Return the limits."""
         return read(TorqueLimits, limits=self.joints.torque_limits)
+
+    def describe(self) -> dict[str, Any]:
+        """Return its name; ``policy.yaml`` has the limits anyway."""
+        return {"model": "ideal"}

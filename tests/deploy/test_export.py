@@ -309,7 +309,7 @@ def test_motors_of_a_user(tmp_path):
     cfg.env.num_envs = 3
     export_random(lambda *args, **kwargs: TorqueRobot(cfg), "a1_torque", tmp_path / "out", supported=False)
     description = read_yaml(tmp_path / "out")
-    assert description["motors"] == {"half": {"share": 0.5}}
+    assert description["motors"]["half"] == {"share": 0.5}
     assert description["unsupported"] == ["no numpy function for the motor 'half'"]
     assert "no numpy function for the motor 'half'" in error_of(Policy, tmp_path / "out")
 

@@ -112,8 +112,8 @@ def test_what_is_not_simulated(make_task, tmp_path):
 @pytest.mark.parametrize(("refresh", "computed"), [(True, 4), (False, 1)])
 def test_torques_are_refreshed(policy, monkeypatch, refresh, computed):
     """Torques are computed anew at every physics step, or once per control step, as the description says."""
-    calls, own = [], policy.torques
-    monkeypatch.setattr(policy, "torques", lambda *values: calls.append(values) or own(*values))
+    calls, own = [], policy.wanted_torques
+    monkeypatch.setattr(policy, "wanted_torques", lambda *values: calls.append(values) or own(*values))
     monkeypatch.setitem(policy.description["timing"], "refresh_torques", refresh)
     Simulation(policy, MujocoRobot(XML, policy.description)).run(1, 1)
     assert len(calls) == computed

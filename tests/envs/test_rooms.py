@@ -8,7 +8,7 @@ from legged_torque.envs.base.asset import nominal_pose
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.motors.joints import by_joint
+from legged_torque.motors.config import by_joint
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.terrain import TERRAINS
 from legged_torque.terrain.terrain import Plane

@@ -16,7 +16,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfgPPO
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
-from legged_torque.motors.joints import by_joint
+from legged_torque.motors.config import by_joint
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.standing import hold_pose

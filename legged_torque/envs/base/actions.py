@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.motors.joints import by_joint
+from legged_torque.motors.config import by_joint
 from legged_torque.motors.kernel import control_law, launch_law, read
 from legged_torque.utils.errors import UserError
 

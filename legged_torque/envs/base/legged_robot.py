@@ -333,7 +333,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)
-        self.motors = MotorChain(cfg.motors, Joints(self.dof_names, self.torque_limits, armature, self.actions, *clock))
+        constants = (self.dof_names, self.torque_limits, armature)
+        self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, self.default_dof_pos))
         self.motor_strength = self.motors.strength
         self._torque_kernel = None
         if "torques_in_kernel" in self.sim.capabilities and cfg.control.refresh_torques:

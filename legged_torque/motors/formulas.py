@@ -1,0 +1,119 @@
+"""Formulas of motor models, each once for torch and numpy; :mod:`legged_torque.motors.models` has them as kernels.
+
+``xp`` is the module of the arrays. ``motor`` has, by name, the constants of the model, what it keeps from step to step,
+and ``dt`` [s], ``decimation``, ``nominal_pose`` [rad] and ``highest_torque`` [N m] of the robot. Arrays have the shape
+(num_dof,) or (num_envs, num_dof).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+SMALL = 1e-6  # in place of zero as a divisor
+
+
+def ideal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """Limits of the robot, the same at any speed."""
+    return xp.clip(wanted, motor.lowest_torque, motor.highest_torque), {}
+
+
+def curve(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """Torque-speed curve in Unitree's form.
+
+    With the motion, at most Y1 (``driving_torque`` [N m]) up to the speed X1 (``knee_speed`` [rad/s]), then less in
+    proportion, and none at X2 (``no_load_speed`` [rad/s]). Against it, Y2 (``braking_torque`` [N m]) at any speed, as
+    in MuJoCo's ``dcmotor``. Unitree's trainer (unitree_rl_lab, unitree_actuators.py) lets it fall to 0 at X2 too, so
+    that fast joints cannot brake.
+
+    The bus voltage, as a share of the nominal one, multiplies X1 and X2. It is ``voltage``, less ``sag`` for each
+    kilowatt of mechanical power in the control step before. This is an assumption, and so are its ranges: Unitree
+    publishes neither torque constants nor resistances.
+    """
+    voltage = motor.voltage * (1.0 - motor.dip)
+    knee, no_load, speed = motor.knee_speed * voltage, motor.no_load_speed * voltage, xp.abs(vel)
+    share = xp.clip((no_load - speed) / xp.clip(no_load - knee, SMALL, None), 0.0, 1.0)
+    most = xp.where(wanted * vel > 0.0, motor.driving_torque * share, motor.braking_torque)
+    torque = xp.clip(wanted, -most, most)
+    return torque, {"power": motor.power + torque * vel / motor.decimation}
+
+
+def sag(xp: Any, motor: Any) -> dict[str, Any]:
+    """Return the share of the voltage that :func:`curve` loses in a new control step; regenerated power is lost."""
+    total = xp.sum(motor.power, axis=-1, keepdims=True)  # [W]
+    return {"dip": xp.clip(motor.sag * total / 1000.0, 0.0, 1.0), "power": xp.zeros_like(motor.power)}
+
+
+def drive(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """A loop that the drive closes by itself at every physics step, without the delay of actions.
+
+    ``wanted + stiffness (nominal_pose - pos) - damping vel``, in N m/rad and N m s/rad. Unitree's drives take torque,
+    Kp, Kd and targets in one message and close this at 10 to 20 kHz.
+    """
+    return wanted + motor.stiffness * (motor.nominal_pose - pos) - motor.damping * vel, {}
+
+
+def lag(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """First-order lag with ``time_constant`` [s], exact for torques that stay the same during a physics step."""
+    torque = motor.torque + _approach(xp, motor) * (wanted - motor.torque)
+    return torque, {"torque": torque}
+
+
+def friction(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """Static, Coulomb and viscous friction.
+
+    ``wanted - dry tanh(vel / activation_speed) - viscous vel`` with ``dry = coulomb + load |wanted| + (static -
+    coulomb) exp(-(vel / stribeck_speed)^2)``, in N m and N m s/rad. With static = coulomb it is that of unitree_rl_lab
+    (Fs, Fd, Va). Stribeck and load are of BAM (github.com/Rhoban/bam), whose load is the torque on the gears, the
+    motor's less the one from outside; only the motor's is known here. It is an explicit force: where static friction
+    over ``activation_speed``, times the physics step, exceeds a joint's inertia, the joint trembles around rest.
+    """
+    stribeck = xp.exp(-((vel / motor.stribeck_speed) ** 2))
+    dry = motor.coulomb_friction + motor.load_friction * xp.abs(wanted)
+    dry = dry + (motor.static_friction - motor.coulomb_friction) * stribeck
+    return wanted - dry * xp.tanh(vel / motor.activation_speed) - motor.viscous_friction * vel, {}
+
+
+def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """Derating by the RMS torque, a measure of heat: ``mean_square`` follows torque^2 with ``time_constant`` [s].
+
+    The limit is the robot's highest torque while the RMS is below ``derating_from`` times ``continuous_torque`` [N m],
+    and falls linearly to the continuous torque, which it reaches when the RMS does.
+    """
+    rms, continuous = xp.sqrt(motor.mean_square), motor.continuous_torque
+    share = xp.clip((continuous - rms) / xp.clip(continuous * (1.0 - motor.derating_from), SMALL, None), 0.0, 1.0)
+    most = continuous + share * xp.clip(motor.highest_torque - continuous, 0.0, None)
+    torque = xp.clip(wanted, -most, most)
+    return torque, {"mean_square": motor.mean_square + _approach(xp, motor) * (torque**2 - motor.mean_square)}
+
+
+def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """Torques as multiples of ``resolution`` [N m], halves to even ones: what a message to the drive can hold."""
+    return motor.resolution * xp.round(wanted / motor.resolution), {}
+
+
+def _approach(xp: Any, motor: Any) -> Any:
+    """Return the share of the way to a constant input that a first-order lag goes in a physics step."""
+    return 1.0 - xp.exp(-motor.dt / xp.clip(motor.time_constant, SMALL, None))
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A formula and what it keeps."""
+
+    function: Callable[..., tuple[Any, dict[str, Any]]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state
+    state: tuple[str, ...] = ()  # names of arrays, 0 at the start of an episode
+    begin: Callable[..., dict[str, Any]] | None = None  # (xp, motor) -> new state, before a control step
+
+
+FORMULAS = {
+    "ideal": Formula(ideal),
+    "curve": Formula(curve, ("power", "dip"), sag),
+    "drive": Formula(drive),
+    "lag": Formula(lag, ("torque",)),
+    "friction": Formula(friction),
+    "thermal": Formula(thermal, ("mean_square",)),
+    "quantize": Formula(quantize),
+}
+"""The formulas by name, as ``policy.yaml`` has it under ``model``."""

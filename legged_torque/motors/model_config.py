@@ -1,0 +1,103 @@
+"""Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from legged_torque.motors.config import MotorCfg, by_joint
+from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.limits import DrawLimits, Interval, Limits
+
+PerJoint = Annotated[float | dict[str, float], Limits(lowest=0)]
+PositivePerJoint = Annotated[float | dict[str, float], Limits(above=0)]
+SharePerJoint = Annotated[float | dict[str, float], Limits(0, 1)]
+Draws = dict[str, Annotated[dict[Literal["set", "add", "scale"], Interval], DrawLimits()]]
+UNLIMITED = 1e9
+
+
+class ModelCfg(MotorCfg):
+    """Settings of a :class:`~legged_torque.motors.models.ModelMotor`; all but ``draws`` are constants by joint."""
+
+    _motor_class = "legged_torque.motors.models:ModelMotor"
+    _model = ""  # name of its formula, see ``motors.formulas``
+    draws: Draws = {}  # of constants by name, each one number per world: ranges as in ``domain_rand``
+
+    def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
+        """Return the numbers of all joints by constant; a UserError names what joints or ``draws`` do not have."""
+        names = [name for name in section_keys(self) if name != "draws"]
+        for name in self.draws:
+            if name not in names:
+                raise unknown_name(f"{path}.draws", name, names)
+        return {name: by_joint(f"{path}.{name}", getattr(self, name), dof_names) for name in names}
+
+    def describe(self) -> dict[str, Any]:
+        """Return model and constants for ``policy.yaml``."""
+        settings = to_dict(self)
+        del settings["draws"]
+        return {"model": self._model} | settings
+
+
+class CurveCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.curve`: at which speed a motor has which torque."""
+
+    _model = "curve"
+    knee_speed: PerJoint = UNLIMITED  # [rad/s] X1, up to which a motor has its whole torque
+    no_load_speed: PerJoint = UNLIMITED  # [rad/s] X2, at which it has none
+    driving_torque: PerJoint = UNLIMITED  # [N m] Y1, most with the motion
+    braking_torque: PerJoint = UNLIMITED  # [N m] Y2, most against it
+    voltage: PerJoint = 1.0  # of the bus, as a share of the nominal one
+    sag: PerJoint = 0.0  # [1/kW] share of the voltage lost per mechanical power of all joints
+
+    def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
+        """Return the numbers of all joints; a UserError if one has its knee beyond the no-load speed."""
+        values = super().constants(dof_names, path)
+        for joint, knee, no_load in zip(dof_names, values["knee_speed"], values["no_load_speed"], strict=True):
+            if knee > no_load:
+                speeds = f"{path}.no_load_speed, {no_load:g}, of the joint '{joint}'"
+                raise UserError(f"{path}.knee_speed must be at most {speeds}, not {knee:g}")
+        return values
+
+
+class DriveCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.drive`: gains that the drive itself closes."""
+
+    _model = "drive"
+    damping: PerJoint = 0.0  # [N m s/rad] Kd
+    stiffness: PerJoint = 0.0  # [N m/rad] Kp, towards the nominal pose
+
+
+class LagCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.lag`: torques rise in a while."""
+
+    _model = "lag"
+    time_constant: PerJoint = 0.0  # [s]
+
+
+class FrictionCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.friction`, in addition to that of the robot's file."""
+
+    _model = "friction"
+    static_friction: PerJoint = 0.0  # [N m] at rest
+    coulomb_friction: PerJoint = 0.0  # [N m] in motion
+    viscous_friction: PerJoint = 0.0  # [N m s/rad]
+    load_friction: PerJoint = 0.0  # share of the motor's torque
+    stribeck_speed: PositivePerJoint = 0.1  # [rad/s] from static to Coulomb friction
+    activation_speed: PositivePerJoint = 0.01  # [rad/s] at which friction acts against the motion
+
+
+class ThermalCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.thermal`: less torque for motors that were loaded for long."""
+
+    _model = "thermal"
+    continuous_torque: PositivePerJoint = UNLIMITED  # [N m] RMS that a motor bears for any time
+    time_constant: PositivePerJoint = 60.0  # [s]
+    derating_from: SharePerJoint = 0.8  # share of the continuous torque
+
+
+class QuantizeCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.quantize`: steps of torques."""
+
+    _model = "quantize"
+    resolution: PositivePerJoint = 0.01  # [N m]

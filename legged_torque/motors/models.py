@@ -1,0 +1,214 @@
+"""Motor models in torch and as kernels; their formulas are in :mod:`legged_torque.motors.formulas`."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged_torque.motors.formulas import FORMULAS, SMALL
+from legged_torque.motors.joints import Joints
+from legged_torque.motors.kernel import read, struct_of
+from legged_torque.motors.model_config import ModelCfg
+from legged_torque.motors.motor import Motor
+from legged_torque.sim.randomization import RandomParameter
+
+_SMALL = wp.constant(SMALL)
+
+
+@wp.func
+def approach(dt: float, time_constant: float) -> float:
+    """Return the share of the way to a constant input that a first-order lag goes in ``dt`` [s]."""
+    return 1.0 - wp.exp(-dt / wp.max(time_constant, _SMALL))
+
+
+@wp.struct
+class Curve:
+    """Inputs of :func:`curve_torque`, all of them (num_envs, num_dof)."""
+
+    knee_speed: wp.array2d[float]
+    no_load_speed: wp.array2d[float]
+    driving_torque: wp.array2d[float]
+    braking_torque: wp.array2d[float]
+    voltage: wp.array2d[float]
+    dip: wp.array2d[float]
+    power: wp.array2d[float]
+    decimation: int
+
+
+@wp.func
+def curve_torque(m: Curve, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.curve`."""
+    voltage = m.voltage[world, joint] * (1.0 - m.dip[world, joint])
+    knee, no_load = m.knee_speed[world, joint] * voltage, m.no_load_speed[world, joint] * voltage
+    share = wp.clamp((no_load - wp.abs(vel)) / wp.max(no_load - knee, _SMALL), 0.0, 1.0)
+    most = wp.where(wanted * vel > 0.0, m.driving_torque[world, joint] * share, m.braking_torque[world, joint])
+    torque = wp.where(wanted < -most, -most, wp.where(wanted > most, most, wanted))  # NaN stays NaN
+    m.power[world, joint] = m.power[world, joint] + torque * vel / float(m.decimation)
+    return torque
+
+
+@wp.struct
+class Drive:
+    """Inputs of :func:`drive_torque`, (num_envs, num_dof) but for the pose (num_dof,)."""
+
+    stiffness: wp.array2d[float]
+    damping: wp.array2d[float]
+    nominal_pose: wp.array[float]
+
+
+@wp.func
+def drive_torque(m: Drive, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.drive`."""
+    return wanted + m.stiffness[world, joint] * (m.nominal_pose[joint] - pos) - m.damping[world, joint] * vel
+
+
+@wp.struct
+class Lag:
+    """Inputs of :func:`lagging_torque`, (num_envs, num_dof)."""
+
+    time_constant: wp.array2d[float]
+    torque: wp.array2d[float]
+    dt: float
+
+
+@wp.func
+def lagging_torque(m: Lag, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.lag`."""
+    before = m.torque[world, joint]
+    torque = before + approach(m.dt, m.time_constant[world, joint]) * (wanted - before)
+    m.torque[world, joint] = torque
+    return torque
+
+
+@wp.struct
+class Friction:
+    """Inputs of :func:`friction_torque`, (num_envs, num_dof)."""
+
+    static_friction: wp.array2d[float]
+    coulomb_friction: wp.array2d[float]
+    viscous_friction: wp.array2d[float]
+    load_friction: wp.array2d[float]
+    stribeck_speed: wp.array2d[float]
+    activation_speed: wp.array2d[float]
+
+
+@wp.func
+def friction_torque(m: Friction, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.friction`."""
+    relative, coulomb = vel / m.stribeck_speed[world, joint], m.coulomb_friction[world, joint]
+    dry = coulomb + m.load_friction[world, joint] * wp.abs(wanted)
+    dry += (m.static_friction[world, joint] - coulomb) * wp.exp(-relative * relative)
+    return wanted - dry * wp.tanh(vel / m.activation_speed[world, joint]) - m.viscous_friction[world, joint] * vel
+
+
+@wp.struct
+class Thermal:
+    """Inputs of :func:`derated_torque`, (num_envs, num_dof) but for the highest torque (num_dof,)."""
+
+    continuous_torque: wp.array2d[float]
+    time_constant: wp.array2d[float]
+    derating_from: wp.array2d[float]
+    mean_square: wp.array2d[float]
+    highest_torque: wp.array[float]
+    dt: float
+
+
+@wp.func
+def derated_torque(m: Thermal, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.thermal`."""
+    heat, continuous = m.mean_square[world, joint], m.continuous_torque[world, joint]
+    span = wp.max(continuous * (1.0 - m.derating_from[world, joint]), _SMALL)
+    share = wp.clamp((continuous - wp.sqrt(heat)) / span, 0.0, 1.0)
+    most = continuous + share * wp.max(m.highest_torque[joint] - continuous, 0.0)
+    torque = wp.where(wanted < -most, -most, wp.where(wanted > most, most, wanted))
+    m.mean_square[world, joint] = heat + approach(m.dt, m.time_constant[world, joint]) * (torque * torque - heat)
+    return torque
+
+
+@wp.struct
+class Quantize:
+    """Inputs of :func:`quantized_torque`, (num_envs, num_dof)."""
+
+    resolution: wp.array2d[float]
+
+
+@wp.func
+def quantized_torque(m: Quantize, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.quantize`."""
+    return m.resolution[world, joint] * wp.rint(wanted / m.resolution[world, joint])
+
+
+KERNELS = {
+    "curve": curve_torque,
+    "drive": drive_torque,
+    "lag": lagging_torque,
+    "friction": friction_torque,
+    "thermal": derated_torque,
+    "quantize": quantized_torque,
+}
+"""The Warp functions of formulas, by name."""
+
+
+class ModelMotor(Motor):
+    """A link that computes a formula, in torch and in the kernel.
+
+    Attributes:
+        values: Constants, state and numbers of the robot by name, see :mod:`legged_torque.motors.formulas`.
+    """
+
+    cfg: ModelCfg
+
+    def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
+        """Lay out the constants, with a row per world for those that are drawn. Errors as of ``cfg.constants``."""
+        super().__init__(cfg, joints)
+        self.formula, self.kernel = FORMULAS[cfg._model], KERNELS[cfg._model]  # type: ignore[misc]
+        self.values = SimpleNamespace(dt=joints.dt, decimation=joints.decimation, nominal_pose=joints.nominal_pose)
+        self.values.highest_torque = joints.torque_limits[1]
+        for name, numbers in cfg.constants(joints.names, joints.section).items():
+            rows = torch.tensor(numbers, device=self.device).expand(self.num_envs, -1)
+            setattr(self.values, name, rows.clone() if name in cfg.draws else rows)
+        for name in self.formula.state:
+            setattr(self.values, name, self.buffer(name, len(joints.names)))
+
+    def send(self, actions: Tensor) -> None:
+        """Begin a control step."""
+        if self.formula.begin:
+            self._keep(self.formula.begin(torch, self.values))
+
+    def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+        """Return the torques of the formula."""
+        torques, state = self.formula.function(torch, self.values, wanted, pos, vel)
+        self._keep(state)
+        return torques
+
+    def _keep(self, state: dict[str, Tensor]) -> None:
+        """Write new state in place."""
+        for name, values in state.items():
+            self._buffers[name].copy_(values)
+
+    def kernel_reads(self) -> Any:
+        """Return those of :attr:`values` that the kernel reads."""
+        struct = struct_of(self.kernel)
+        return read(struct, **{name: getattr(self.values, name) for name in struct.vars})
+
+    def reset(self, mask: Tensor) -> None:
+        """Forget the state of ended episodes."""
+        for values in self._buffers.values():
+            values.masked_fill_(mask.unsqueeze(1), 0.0)
+
+    def random_parameters(self) -> list[RandomParameter]:
+        """Return what ``draws`` names, each as one number per world."""
+        link, columns = self.joints.section.removeprefix("motors."), range(len(self.joints.names))
+        draws: dict[str, Any] = self.cfg.draws
+        return [
+            RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
+            for name, draw in draws.items()
+        ]
+
+    def describe(self) -> dict[str, Any]:
+        """Return model and constants."""
+        return self.cfg.describe()

@@ -1,0 +1,86 @@
+"""Motors in numpy, as ``policy.yaml`` describes them: for simulations without torch."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from legged_torque.motors.formulas import FORMULAS
+from legged_torque.motors.model_config import (
+    CurveCfg,
+    DriveCfg,
+    FrictionCfg,
+    LagCfg,
+    ModelCfg,
+    QuantizeCfg,
+    ThermalCfg,
+)
+from legged_torque.utils.config import update_from_dict
+from legged_torque.utils.errors import UserError
+
+SETTINGS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, FrictionCfg, LagCfg, QuantizeCfg, ThermalCfg)}
+"""Settings by model: they check the constants in a file."""
+
+
+class MotorTwin:
+    """The motors of one robot behind its control law; limits alone if ``policy.yaml`` names no motors.
+
+    Call :meth:`begin` before each control step, :meth:`apply` at each physics step and :meth:`reset` before an episode.
+    """
+
+    def __init__(self, description: dict[str, Any]) -> None:
+        """Read the sections ``motors``, ``joint_order``, ``torque_limits``, ``nominal_pose`` and ``timing``.
+
+        A UserError names a motor without a function here, and constants that make no sense.
+        """
+        names, timing = description["joint_order"], description["timing"]
+        limits = np.array([description["torque_limits"][name] for name in names], np.float32).T
+        robot = {"lowest_torque": limits[0], "highest_torque": limits[1], "decimation": timing["decimation"]}
+        robot |= {"dt": np.float32(1.0 / timing["physics_frequency"])}
+        robot |= {"nominal_pose": np.array([description["nominal_pose"][name] for name in names], np.float32)}
+        self._links = []
+        for link, described in (description.get("motors") or {"ideal": {"model": "ideal"}}).items():
+            constants, model = dict(described), described.get("model")
+            if without_function(described):
+                raise UserError(f"no numpy function for the motor '{link}'")
+            del constants["model"]
+            values = _constants(SETTINGS[model](), constants, names, f"motors.{link}") if model in SETTINGS else {}
+            self._links.append((FORMULAS[model], SimpleNamespace(**robot, **values)))
+        self._shape = (len(names),)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode: forget what motors keep from step to step."""
+        for formula, motor in self._links:
+            vars(motor).update({name: np.zeros(self._shape, np.float32) for name in formula.state})
+
+    def begin(self) -> None:
+        """Begin a control step."""
+        for formula, motor in self._links:
+            if formula.begin:
+                vars(motor).update(formula.begin(np, motor))
+
+    def apply(self, wanted: np.ndarray, pos: np.ndarray, vel: np.ndarray) -> np.ndarray:
+        """Return the torques that joints get of those that a control law asks for [N m].
+
+        Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
+        """
+        torques, pos, vel = (np.asarray(values, np.float32) for values in (wanted, pos, vel))
+        for formula, motor in self._links:
+            torques, state = formula.function(np, motor, torques, pos, vel)
+            vars(motor).update(state)
+        return torques
+
+
+def without_function(described: dict[str, Any]) -> bool:
+    """Return whether a motor of ``policy.yaml`` is of a model that is not known here."""
+    return described.get("model") not in FORMULAS
+
+
+def _constants(cfg: ModelCfg, given: dict[str, Any], names: list[str], path: str) -> dict[str, np.ndarray]:
+    """Return constants by name; a UserError names those that do not exist or make no sense. Shapes: (joints,)."""
+    update_from_dict(cfg, given, path)
+    cfg.check(path)
+    return {name: np.array(values, np.float32) for name, values in cfg.constants(names, path).items()}

@@ -1,0 +1,236 @@
+"""Motor models: each as its formula by hand in torch, in the kernel and in numpy; MuJoCo's DC motor; refusals."""
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from support.settings import error_of
+
+from legged_torque.motors import models
+from legged_torque.motors.joints import Joints
+from legged_torque.motors.twin import SETTINGS, MotorTwin
+from legged_torque.sim.randomization import Randomization
+from legged_torque.utils.config import update_from_dict
+
+NAMES = ["hip", "thigh", "calf"]
+WORLDS, STEPS, DECIMATION, DT, PEAK = 40, 6, 2, 0.005, 30.0
+POSE = np.array([0.1, 0.8, -1.5])
+CONSTANTS = {
+    "curve": {
+        "knee_speed": {"hip": 13.5, "thigh": 10.0, "calf": 8.0},
+        "no_load_speed": {"calf": 8.0, "h": 30.0},
+        "driving_torque": 20.2,
+        "braking_torque": 23.4,
+        "sag": 0.5,
+    },
+    "drive": {"damping": {"hip": 0.5, "thigh": 1.0, "calf": 0.0}, "stiffness": 20.0},
+    "lag": {"time_constant": {"hip": 0.0, "thigh": 0.002, "calf": 0.02}},
+    "friction": {
+        "static_friction": 2.4,
+        "coulomb_friction": 1.6,
+        "viscous_friction": 0.16,
+        "load_friction": 0.05,
+        "activation_speed": 0.5,
+    },
+    "thermal": {"continuous_torque": {"hip": 5.0, "thigh": 12.0, "calf": 40.0}, "time_constant": 0.02},
+    "quantize": {"resolution": {"hip": 0.5, "thigh": 0.01, "calf": 3.0}},
+}
+
+
+def by_hand(model, wanted, pos, vel):
+    """Torques of all steps from a model's formula. Shapes: (steps, worlds, joints)."""
+    if model == "drive":
+        return wanted - np.array([0.5, 1.0, 0.0]) * vel + 20.0 * (POSE - pos)
+    if model == "friction":
+        dry = 1.6 + 0.05 * np.abs(wanted) + 0.8 * np.exp(-np.square(10.0 * vel))
+        return wanted - dry * np.tanh(2.0 * vel) - 0.16 * vel
+    if model == "quantize":
+        return np.rint(wanted / [0.5, 0.01, 3.0]) * [0.5, 0.01, 3.0]
+    torques, state = np.zeros_like(wanted), np.zeros(wanted.shape[1:])
+    voltage = np.ones((wanted.shape[1], 1))
+    for step, (asked, speed) in enumerate(zip(wanted, vel, strict=True)):
+        if model == "lag":
+            state = torques[step] = asked + np.exp(-DT / np.array([1e-9, 0.002, 0.02])) * (state - asked)
+        elif model == "thermal":
+            rated, decay = np.array([5.0, 12.0, 40.0]), np.exp(-DT / 0.02)
+            most = [np.interp(np.sqrt(state[:, j]), [0.8 * r, r], [max(PEAK, r), r]) for j, r in enumerate(rated)]
+            torques[step] = np.clip(asked, -np.transpose(most), np.transpose(most))
+            state = decay * state + (1.0 - decay) * torques[step] ** 2
+        else:
+            if step % DECIMATION == 0 and step:
+                power = (torques[step - DECIMATION : step] * vel[step - DECIMATION : step]).sum(axis=2).mean(axis=0)
+                voltage = 1.0 - np.clip(power / 2000.0, 0.0, 1.0)[:, None]
+            knees, ends = np.array([13.5, 10.0, 8.0]) * voltage, np.array([30.0, 30.0, 8.0]) * voltage
+            share = np.clip((ends - np.abs(speed)) / np.maximum(ends - knees, 1e-9), 0.0, 1.0)
+            most = np.where(np.sign(asked) == np.sign(speed), 20.2 * share, 23.4)
+            torques[step] = np.sign(asked) * np.minimum(np.abs(asked), most)
+    return torques
+
+
+def joints(worlds=WORLDS):
+    """Three joints on a CPU."""
+    limits, actions = torch.tensor([[-PEAK] * 3, [PEAK] * 3]), torch.zeros(worlds, 3)
+    pose = torch.tensor(POSE, dtype=torch.float32)
+    return Joints(NAMES, limits, torch.zeros(3), actions, DT, DECIMATION, pose, "motors.own")
+
+
+def settings(model, **constants):
+    """Settings of a model."""
+    cfg = SETTINGS[model]()
+    update_from_dict(cfg, constants, "motors.own")
+    cfg.check("motors.own")
+    return cfg
+
+
+def described(model, constants):
+    """What the twin reads of ``policy.yaml``."""
+    by_joint = {"torque_limits": [-PEAK, PEAK]}
+    description = {key: dict.fromkeys(NAMES, value) for key, value in by_joint.items()}
+    description |= {"joint_order": NAMES, "nominal_pose": dict(zip(NAMES, POSE.tolist(), strict=True))}
+    description["timing"] = {"decimation": DECIMATION, "physics_frequency": 1.0 / DT}
+    return description | {"motors": {"own": {"model": model, **constants}}}
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def evaluate_all(
+    # In:
+    curve: models.Curve,
+    drive: models.Drive,
+    lag: models.Lag,
+    friction: models.Friction,
+    thermal: models.Thermal,
+    quantize: models.Quantize,
+    wanted: wp.array2d[float],
+    pos: wp.array2d[float],
+    vel: wp.array2d[float],
+    # Out:
+    torques: wp.array3d[float],
+):
+    """Compute the torques of all models for the same joints, so that one compilation serves all of them."""
+    i, j = wp.tid()
+    tau, q, qd = wanted[i, j], pos[i, j], vel[i, j]
+    torques[0, i, j] = models.curve_torque(curve, i, j, 0, tau, q, qd)
+    torques[1, i, j] = models.drive_torque(drive, i, j, 0, tau, q, qd)
+    torques[2, i, j] = models.lagging_torque(lag, i, j, 0, tau, q, qd)
+    torques[3, i, j] = models.friction_torque(friction, i, j, 0, tau, q, qd)
+    torques[4, i, j] = models.derated_torque(thermal, i, j, 0, tau, q, qd)
+    torques[5, i, j] = models.quantized_torque(quantize, i, j, 0, tau, q, qd)
+
+
+def draw(*shape):
+    """Torques, positions and speeds, some at rest."""
+    rng = np.random.default_rng(0)
+    wanted, pos, vel = (rng.uniform(-size, size, shape).astype(np.float32) for size in (40.0, 2.0, 40.0))
+    vel[:, ::4] *= 0.002
+    return wanted, pos, vel
+
+
+@pytest.fixture(scope="module")
+def computed():
+    """Torques by way of computing and model. Shapes: (steps, worlds, joints)."""
+    wp.init()
+    wanted, pos, vel = draw(STEPS, WORLDS, 3)
+    found = {(way, model): np.zeros_like(wanted) for way in ("torch", "kernel", "numpy") for model in CONSTANTS}
+    in_torch, in_kernel = (
+        {model: settings(model, **own).build(joints()) for model, own in CONSTANTS.items()} for _ in range(2)
+    )
+    reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(6, WORLDS, 3)
+    twins = {model: [MotorTwin(described(model, own)) for _ in range(WORLDS)] for model, own in CONSTANTS.items()}
+    for step in range(STEPS):
+        inputs = [torch.tensor(values[step]) for values in (wanted, pos, vel)]
+        if step % DECIMATION == 0:
+            for link in (*in_torch.values(), *in_kernel.values()):
+                link.send(torch.zeros(WORLDS, 3))
+        wp.launch(evaluate_all, (WORLDS, 3), [*reads, *map(wp.from_torch, (*inputs, out))], device="cpu")
+        for number, model in enumerate(CONSTANTS):
+            found["torch", model][step] = in_torch[model].apply(*inputs, step % DECIMATION)
+            found["kernel", model][step] = out[number]
+            for world, twin in enumerate(twins[model]):
+                if step % DECIMATION == 0:
+                    twin.begin()
+                found["numpy", model][step, world] = twin.apply(*(values[step, world] for values in (wanted, pos, vel)))
+    return found
+
+
+@pytest.mark.parametrize("model", CONSTANTS)
+@pytest.mark.parametrize("way", ["torch", "kernel", "numpy"])
+def test_formula(computed, way, model):
+    """Each way gives the torques of the formula, to a millionth of the largest one."""
+    expected = by_hand(model, *(values.astype(float) for values in draw(STEPS, WORLDS, 3)))
+    np.testing.assert_allclose(computed[way, model], expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
+
+
+def test_as_mujoco_s_dc_motor():
+    """A curve with the line of a DC motor has the torque of MuJoCo's at full voltage, with its limit of the torque."""
+    constant, resistance, volts, most = 0.8, 0.9, 24.0, 15.0  # [N m/A], [ohm], [V], [N m]
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body()
+    body.add_joint(name="joint", type=mujoco.mjtJoint.mjJNT_HINGE)
+    body.add_geom(size=[0.1, 0.1, 0.1])
+    actuator = spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_JOINT, target="joint")
+    actuator.set_to_dcmotor([constant, constant], resistance, saturation=[most, 0.0, 0.0])
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    knee, no_load = (volts - most * resistance / constant) / constant, volts / constant
+    curve = {"knee_speed": knee, "no_load_speed": no_load, "driving_torque": most, "braking_torque": most}
+    twin = MotorTwin(described("curve", curve))
+    for speed in np.linspace(-40.0, 29.0, 24):
+        data.ctrl, data.qvel = volts, speed
+        mujoco.mj_forward(model, data)
+        assert twin.apply(np.full(3, 100.0), POSE, np.full(3, speed)) == pytest.approx(data.actuator_force[0], abs=1e-5)
+
+
+def test_energy_of_the_drive():
+    """What damping on the drive takes from a turning body is what the body loses, step by step, as MuJoCo counts it."""
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="0.002" gravity="0 0 0"><flag energy="enable"/></option><worldbody><body>'
+        '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'
+        '<actuator><motor joint="joint"/></actuator></mujoco>'
+    )
+    data, twin, lost = mujoco.MjData(model), MotorTwin(described("drive", {"damping": 0.05})), 0.0
+    data.qvel = 12.0
+    mujoco.mj_forward(model, data)
+    start = data.energy[1]
+    for _ in range(200):
+        data.ctrl, before = twin.apply(np.zeros(3), POSE, np.full(3, data.qvel[0]))[0], data.qvel[0]
+        mujoco.mj_step(model, data)
+        lost += 0.05 * before * (before + data.qvel[0]) / 2.0 * 0.002
+    mujoco.mj_forward(model, data)
+    assert start - data.energy[1] == pytest.approx(lost, rel=1e-6) and data.energy[1] < 0.1 * start
+
+
+def test_draws_and_resets():
+    """A constant is drawn as one number per world, of all joints; state goes with an episode."""
+    cfg = settings("curve", **CONSTANTS["curve"], draws={"voltage": {"set": [0.8, 1.1]}})
+    link = cfg.build(joints(200))
+    drawn = Randomization(link.random_parameters(), lambda *_: None, 200, "cpu")
+    drawn.seeds.random_()
+    drawn.draw(torch.ones(200, dtype=torch.bool))
+    voltage = link.values.voltage
+    assert (voltage == voltage[:, :1]).all() and 0.8 <= voltage.min() < 0.81 and 1.09 < voltage.max() <= 1.1
+    speeds = torch.full((200, 3), 24.0)
+    torques = link.apply(torch.full((200, 3), 40.0), speeds, speeds, 0)
+    expected = 20.2 * ((30.0 * voltage - 24.0) / (16.5 * voltage)).clamp(0.0, 1.0)
+    torch.testing.assert_close(torques[:, 0], expected[:, 0])
+    link.reset(torch.arange(200) < 100)
+    assert (link.values.power[:100] == 0.0).all() and (link.values.power[100:, 0] > 0.0).any()
+
+
+@pytest.mark.parametrize(
+    ("model", "constants", "words"),
+    [
+        ("curve", {"knee_speed": 31.0, "no_load_speed": 30.0}, ["motors.own.knee_speed", "30", "31", "'hip'"]),
+        ("curve", {"braking_torque": -1.0}, ["motors.own.braking_torque", "at least 0", "-1"]),
+        ("drive", {"damping": {"hip": 1.0}}, ["motors.own.damping", "thigh"]),
+        ("lag", {"time_constnt": 0.1}, ["time_constant"]),
+        ("friction", {"activation_speed": 0.0}, ["motors.own.activation_speed", "greater than 0"]),
+        ("thermal", {"draws": {"continous_torque": {"scale": [0.9, 1.1]}}}, ["did you mean 'continuous_torque'"]),
+    ],
+)
+def test_refused(model, constants, words):
+    """Constants that make no sense are refused by name, in settings and in ``policy.yaml``."""
+    lines = [error_of(lambda: settings(model, **constants).build(joints()))]
+    if "draws" not in constants:
+        lines.append(error_of(MotorTwin, described(model, constants)))
+    assert all(word in line for word in words for line in lines)
