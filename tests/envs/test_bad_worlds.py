@@ -30,8 +30,8 @@ DRAWN_BUFFERS = {
     "gravity": lambda task: task.sim.fields["gravity"],
 }
 DELAYED_BUFFERS = {
-    "delay.drawn": lambda task: task.motors.links["delay"].drawn,
-    "delay.before": lambda task: task.motors.links["delay"].before[:, 0],
+    "delay.drawn": lambda task: task.motors.links["delay"].queue.drawn,
+    "delay.before": lambda task: task.motors.links["delay"].queue.before[:, 0],
     "observation_history": lambda task: task.obs_buf["policy"][:, -1:],
 }
 

@@ -107,7 +107,9 @@ class LeggedRobotCfg(BaseConfig):
 
         class delay(DelayCfg):  # time from the policy to the motors
             range = [0, 0]  # in ``unit``, drawn at every reset
-            unit = "physics_steps"  # or "control_steps"
+            unit = "physics_steps"  # of range and jitter
+            jitter = 0  # in ``unit``, up to which the actions of each control step are later
+            loss = 0.0  # share of control steps whose actions are lost: those before are held
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
