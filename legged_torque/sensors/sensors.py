@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -12,7 +12,9 @@ from torch import Tensor
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sensors.config import SensorCfg
 from legged_torque.sensors.height_scan import HeightScan
+from legged_torque.sensors.sensing import Sensing
 from legged_torque.sensors.sensor import Sensor
+from legged_torque.sim.randomization import RandomParameter
 
 
 class Sensors(dict[str, Sensor]):
@@ -20,25 +22,37 @@ class Sensors(dict[str, Sensor]):
 
     Attributes:
         height_scan: The height scan; None on a plane.
+        sensing: Joint encoders and IMU; None if what they measure is not late.
         has_kernels: Whether some of them launch kernels of Warp, which cannot be compiled with torch's operations.
     """
 
-    def __init__(self, settings: Any, terrain: Any, state: RobotState, add_noise: bool) -> None:
-        """Build the sensors of the sections ``sensors`` and ``terrain`` of settings."""
-        sections = {name: value for name, value in vars(settings).items() if isinstance(value, SensorCfg)}
+    def __init__(self, cfg: Any, state: RobotState) -> None:
+        """Build the sensors of the sections ``sensors``, ``terrain`` and ``sensing`` of a task's settings."""
+        sections = {name: value for name, value in vars(cfg.sensors).items() if isinstance(value, SensorCfg)}
         super().__init__({name: section.build(state) for name, section in sections.items()})
-        self.height_scan = HeightScan(terrain, state) if state.ground.map is not None else None
+        self.height_scan = HeightScan(cfg.terrain, state) if state.ground.map is not None else None
         if self.height_scan:
             self["height_scan"] = self.height_scan
         for sensor in self.values():
-            sensor.has_noise = add_noise
+            sensor.has_noise = cfg.noise.add_noise
         self.has_kernels = not all(sensor.compilable for sensor in self.values())
+        sensing = Sensing(cfg.sensing.delay, state, cfg.sim.dt, cfg.control.decimation)
+        self.sensing = sensing if sensing.queue.is_needed else None
+
+    def begin_step(self) -> Callable[[], None] | None:
+        """Begin a control step, and return what must be called after each of its physics steps, if anything."""
+        if not self.sensing:
+            return None
+        self.sensing.begin()
+        return self.sensing.measure
 
     def update_all(self, is_new: Tensor, compilable: bool) -> None:
         """Let those sensors measure that are ``compilable``, or those that are not; see :meth:`Sensor.update`."""
         for sensor in self.values():
             if sensor.compilable == compilable:
                 sensor.update(is_new)
+        if self.sensing and compilable:
+            self.sensing.update(is_new)
 
     @contextlib.contextmanager
     def looking_ahead(self) -> Iterator[None]:
@@ -46,6 +60,8 @@ class Sensors(dict[str, Sensor]):
         kept = {name: {key: value.clone() for key, value in s.state_dict().items()} for name, s in self.items()}
         for sensor in self.values():
             sensor.update(torch.zeros_like(sensor.state.reset_buf))
+        if self.sensing:
+            self.sensing.look()
         yield
         for name, sensor in self.items():
             for key, value in sensor.state_dict().items():
@@ -53,4 +69,14 @@ class Sensors(dict[str, Sensor]):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the sensors keep, by name."""
-        return {name: sensor.state_dict() for name, sensor in self.items()}
+        late = {"sensing.queue": self.sensing.queue.state_dict()} if self.sensing else {}
+        return {name: sensor.state_dict() for name, sensor in self.items()} | late
+
+    def watched(self) -> dict[str, Tensor]:
+        """Return the tensors that must be finite in every world. Shapes: (num_envs, any)."""
+        kept = self.sensing.queue.state_dict() if self.sensing else {}
+        return {f"sensing.{name}": value.flatten(1) for name, value in kept.items()}
+
+    def random_parameters(self) -> list[RandomParameter]:
+        """Return what is drawn of the sensors."""
+        return [self.sensing.queue.random_parameter("sensing_delay")] if self.sensing else []

@@ -174,6 +174,8 @@ def test_draws(make_task, low, high, unit):
         ("range", {"range": [0, 1.5]}),
         ("range", {"range": []}),
         ("unit", {"unit": "steps"}),
+        ("jitter", {"jitter": -1}),
+        ("loss", {"loss": 1.5}),
     ],
 )
 def test_settings_that_make_no_sense(make_task, key, changes):
@@ -184,6 +186,17 @@ def test_settings_that_make_no_sense(make_task, key, changes):
     for name, value in changes.items():
         setattr(cfg.motors.delay, name.removeprefix("motors.delay."), value)
     assert f"motors.delay.{key}" in error_of(check_env_cfg, cfg)
+
+
+def test_milliseconds(make_task):
+    """A range in milliseconds is one in physics steps, which must be whole ones."""
+    fast = {"sim.dt": 0.0025}
+    task = make_task("a1_torque", 3, **delayed(10, 10, "milliseconds", **fast))
+    notes = watch(task)
+    sent = send(task, 4)
+    assert np.array_equal(torques_of(notes), 8.0 * arrived(sent, 4, 4))
+    line = error_of(make_task, "a1_torque", 1, **delayed(0, 7, "milliseconds", **fast))
+    assert "motors.delay.range" in line and "2.5 ms" in line
 
 
 def test_torques_that_cannot_follow(make_task):

@@ -92,7 +92,7 @@ def test_simulator_drives():
         ("a1_position", {"domain_rand.randomize_parameters": True}),
         ("a1_torque", {"motors.delay.range": [0, 9], "control.decimation": 3}),
         ("a1_multihead", {"motors.delay.range": [1, 2], "motors.delay.unit": "control_steps"}),
-        ("a1_torque_multihead", {"motors.delay.range": [2, 6]}),
+        ("a1_torque_multihead", {"motors.delay.range": [2, 6], "motors.delay.jitter": 5, "motors.delay.loss": 0.2}),
         ("a1_multihead_two_rates", {"motors.delay.range": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
     ],
 )

@@ -17,6 +17,8 @@ WORDS += ["--set=actor.hidden_dims=[8, 8]", "--set=actor.head_hidden_dims=[8]", 
 WORDS += ["--set=evaluation.interval=24", "--set=evaluation.num_samples=60", "--set=env.episode_length_s=0.2"]
 WORDS += ["--set=evaluation.also=[high]", "--set=evaluation.also_from=48"]
 WORDS += ["--set=env.history_length=2", "--set=motors.delay.range=[0, 3]"]
+WORDS += ["--set=motors.delay.jitter=5", "--set=motors.delay.loss=0.2"]
+WORDS += ["--set=sensing.delay.range=[0, 3]", "--set=sensing.delay.jitter=2", "--set=sensing.delay.loss=0.2"]
 
 
 def start(root, *words):

@@ -109,7 +109,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._init_random_events()
         self._init_observations()
         kept = {"actions": self._given_actions, **self.randomization.fields, **self.motors.watched()}
-        kept["random_parameters"] = self.randomization.values
+        kept |= {"random_parameters": self.randomization.values, **self.sensors.watched()}
         self.health = Health(watched(self.state, kept, self.rewards, self.observations), self.sim.diverged)
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
@@ -135,8 +135,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the terms of all groups of observations."""
-        drawn, scan = (self.randomization.values, self.parameter_mirrors), self.sensors.height_scan
-        return standard_terms(self.cfg, self.state, self.control, *drawn, self.symmetry, scan)
+        drawn = (self.randomization.values, self.parameter_mirrors)
+        return standard_terms(self.cfg, self.state, self.control, *drawn, self.symmetry, self.sensors)
 
     def random_parameters(self) -> list[RandomParameter]:
         """Return what ``domain_rand`` draws in each world."""
@@ -170,8 +170,9 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """Do the physics steps of a control step, with torques inside of them where that is possible."""
         self.motors.send(self.actions)
         decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
+        measure = self.sensors.begin_step()
         if self._torque_kernel and not self._is_overridden():
-            self.sim.drive(decimation, *self._torque_kernel)
+            self.sim.drive(decimation, *self._torque_kernel, measure)
             return
         pos, vel = self.dof_pos, self.dof_vel
         for i in range(decimation):
@@ -179,6 +180,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
                 wanted = self._compute_torques(self.motors.actions(pos, vel, i))
             self.torques.copy_(self.motors.apply(wanted, pos, vel, i))
             self.sim.step(sense=i == decimation - 1)
+            if measure:
+                measure()
 
     def _is_overridden(self) -> bool:
         """Return whether torques are computed by another method than that of this class."""
@@ -342,7 +345,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
             self._torque_kernel = self.motors.kernel(law) if law else None
             if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
-        self.sensors = Sensors(cfg.sensors, cfg.terrain, self.state, cfg.noise.add_noise)
+        self.sensors = Sensors(cfg, self.state)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
@@ -358,11 +361,11 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         commands: Any = cfg.commands
         self.command_generator = commands.build(self)
         angles = torch.zeros(self.num_envs, 3, device=self.device)
-        of_motors = self.motors.random_parameters()
+        of_robot = self.motors.random_parameters() + self.sensors.random_parameters()
         pose, state = self.default_dof_pos.tolist(), (self.sim.qpos, self.sim.qvel)
         at_reset = initial_state(cfg, model, *state, angles, pose)
-        at_reset += [*(drawn for drawn in of_motors if drawn.at_reset_only), initial_place(cfg, self.sim.qpos)]
-        declared = [*self.random_parameters(), *(drawn for drawn in of_motors if not drawn.at_reset_only)]
+        at_reset += [*(drawn for drawn in of_robot if drawn.at_reset_only), initial_place(cfg, self.sim.qpos)]
+        declared = [*self.random_parameters(), *(drawn for drawn in of_robot if not drawn.at_reset_only)]
         drawn = with_settings(declared, rand, cfg.random_parameters())
         self.events = RandomEvents(cfg, self.sim, self.command_generator, angles, at_reset, drawn)
         self.randomization = self.events.parameters

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
-from legged_torque.motors.config import DelayCfg, IdealCfg
+from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import (
@@ -107,10 +107,19 @@ class LeggedRobotCfg(BaseConfig):
 
         class delay(DelayCfg):  # time from the policy to the motors
             range = [0, 0]  # in ``unit``, drawn at every reset
-            unit = "physics_steps"  # or "control_steps"
+            unit = "physics_steps"  # of range and jitter
+            jitter = 0  # in ``unit``, up to which the actions of each control step are later
+            loss = 0.0  # share of control steps whose actions are lost: those before are held
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
+
+    class sensing:  # from the robot's own sensors, joint encoders and IMU, to the policy
+        class delay(LatencyCfg):  # of the measurement of each physics step; the critic sees the present
+            range = [0, 0]  # in ``unit``, drawn at every reset
+            unit = "physics_steps"  # of range and jitter
+            jitter = 0  # in ``unit``, up to which each measurement is later
+            loss = 0.0  # share of measurements that are lost: those before are held
 
     class sensors:  # sensors by name: a sensor is a section with a method ``build``
         pass

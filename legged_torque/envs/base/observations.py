@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.symmetry import RobotSymmetry
-from legged_torque.sensors.height_scan import CLIP, OFFSET, HeightScan
+from legged_torque.sensors.height_scan import CLIP, OFFSET
+from legged_torque.sensors.sensors import Sensors
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
@@ -34,6 +36,7 @@ class ObservationTerm:
     unit: str = ""  # of the values
     frame: str = "none"  # in which they are given: "trunk", "joint" or "none"
     meaning: str = ""  # what they are
+    sensed: Callable[[], Tensor] | None = None  # of the policy in place of value, where that reaches it late
     group: str = ""  # a group of its own, which ``obs_groups`` can give to a network; empty: "policy" and "critic"
 
 
@@ -58,7 +61,7 @@ def standard_terms(
     parameters: Tensor,
     parameter_mirrors: Mapping[str, Mirroring | None],
     symmetry: RobotSymmetry,
-    scan: HeightScan | None,
+    sensors: Sensors,
 ) -> list[ObservationTerm]:
     """Return the terms of all tasks: what a real robot can measure (paper, App. I-B), then what only a simulator knows.
 
@@ -71,9 +74,10 @@ def standard_terms(
         parameters: The drawn parameters, see ``Randomization.values``. Shape: (num_envs, any).
         parameter_mirrors: Their mirror images, by name.
         symmetry: Which joints and feet are mirror images of each other.
-        scan: The height scan, on rough ground.
+        sensors: What the policy's sensors have measured.
     """
     scales, noise = cfg.normalization.obs_scales, cfg.noise.noise_scales
+    scan, sensing = sensors.height_scan, sensors.sensing
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
     actions = joints and Mirroring.joined([joints] * (state.actions.shape[1] // state.dof_pos.shape[1]))
@@ -98,6 +102,14 @@ def standard_terms(
         term("feet_contact", lambda: state.feet_contact, feet, privileged=True),
         term("random_parameters", lambda: parameters, parameter_mirror, privileged=True),
     ]
+    if sensing:
+        late: dict[str, Callable[[], Tensor]] = {
+            "projected_gravity": lambda: sensing.projected_gravity,
+            "angular_velocity": lambda: sensing.base_ang_vel,
+            "joint_position": lambda: sensing.dof_pos - control.default_dof_pos,
+            "joint_velocity": lambda: sensing.dof_vel,
+        }
+        terms = [dataclasses.replace(term, sensed=late.get(term.name)) for term in terms]
     if scan:
         factors, is_seen = (scales.height_measurements, noise.height_measurements), cfg.terrain.measure_heights
         if is_seen and scan.delay:
@@ -183,6 +195,9 @@ class Observations:
         critic = torch.cat([term.value() for term in self.terms], dim=1) * self._scales
         critic = _marked(critic)  # not clipped: it must be noticed
         policy = critic[:, : self.policy_size]
+        if any(term.sensed for term in self.policy_terms()):
+            sensed = [(term.sensed or term.value)() for term in self.policy_terms()]
+            policy = _marked(torch.cat(sensed, dim=1) * self._scales[: self.policy_size])
         if self._add_noise:
             policy = torch.addcmul(policy, self._noise, 2.0 * torch.rand(policy.shape, device=policy.device) - 1.0)
         policy = policy.clamp(-self._clip, self._clip)

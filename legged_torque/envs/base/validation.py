@@ -26,7 +26,7 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
         if name not in parameters:
             raise unknown_name("parameter in domain_rand.keep_fixed", name, parameters)
     delay = cfg.motors.delay
-    if delay.range[1] and delay.unit == "physics_steps" and not cfg.control.refresh_torques:
+    if (delay.range[1] or delay.jitter) and delay.unit != "control_steps" and not cfg.control.refresh_torques:
         raise UserError(
             "motors.delay.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
             "per control step"
