@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Protocol
 
 import mujoco
@@ -135,12 +135,13 @@ class Engine(Protocol):
 
     # ---- "torques_in_kernel" -----------------------------------------------------------------------------------------
 
-    def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
+    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Callable[[], None] | None = None) -> None:
         """Advance every world by some physics steps, each under torques of its own; the last one senses.
 
         Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
         which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
-        ``reads`` is an instance of the Warp struct that is the type of the law's first argument.
+        ``reads`` is an instance of the Warp struct that is the type of the law's first argument. After each physics
+        step, ``after_step`` is called to look at the state.
         """
         raise lacks(self, "torques_in_kernel")
 

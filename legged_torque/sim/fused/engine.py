@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
@@ -68,15 +68,17 @@ class FusedEngine(WarpEngine):
         """Launch one physics step."""
         self._launch(range(1), sense, None, 0)
 
-    def drive(self, steps: int, law: wp.Function, reads: Any) -> None:
+    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Callable[[], None] | None = None) -> None:
         """Launch some physics steps under a control law.
 
         On a GPU each step is a launch: within one, worlds drift apart, and threads at different places of this long
         kernel wait for its instructions (one launch for four steps takes 1.1 to 1.6 times as long on an H200).
         """
         step_by_step = [range(i, i + 1) for i in range(steps)]
-        for part in step_by_step if self._wp_device.is_cuda else [range(steps)]:
+        for part in step_by_step if self._wp_device.is_cuda or after_step else [range(steps)]:
             self._launch(part, part.stop == steps, law, reads)
+            if after_step:
+                after_step()
 
     def _launch(self, steps: range, sense: bool, law: wp.Function | None, reads: Any) -> None:
         """Run the kernel for some steps, the last of which may sense."""
