@@ -101,7 +101,7 @@ def main() -> None:
                 after = (record, show, counter.add)
                 sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
-    metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step))
+    metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step, simulation.has_losses))
     print(f"  {counted(args.robots, 'robot')} x {counted(args.steps, 'step')} of {control_step:g} s")
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")

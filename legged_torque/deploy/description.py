@@ -79,7 +79,8 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
     """
     _check_schema(description, where)
     joints = description["joint_order"]
-    by_joint = {key: description[key] for key in ("nominal_pose", "torque_limits", "joints")}
+    keys = ("nominal_pose", "torque_limits", "joints", "copper_loss")
+    by_joint = {key: description[key] for key in keys if key in description}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
         for name in values:

@@ -29,6 +29,7 @@ class Simulation:
 
     Attributes:
         command: Present v_x, v_y [m/s] and yaw rate [rad/s]. Shape: (3,).
+        has_losses: Whether the policy's description has copper losses, so that they are measured.
         notes: Differences from the training, a line each.
     """
 
@@ -69,7 +70,10 @@ class Simulation:
             )
         if others := description["episode"].get("not_simulated"):
             self.notes.append(f"episodes of the training are different, by {', '.join(others)}")
-        self.command = np.zeros(3)
+        losses = description.get("copper_loss", {})
+        self._copper_loss = np.array([losses.get(name, 0.0) for name in policy.joint_order])
+        self.has_losses = bool(self._copper_loss.any())
+        self.command, self._power = np.zeros(3), np.zeros(2)
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
@@ -98,7 +102,7 @@ class Simulation:
         return sums
 
     def _control_step(self) -> None:
-        """Observe, act, and apply torques in all physics steps of a control step."""
+        """Observe, act, and apply torques in all physics steps of a control step; keep their mean power [W]."""
         policy, robot = self.policy, self.robot
         state = robot.state()
         places = policy.scan_places(robot.position, robot.quat)
@@ -106,11 +110,15 @@ class Simulation:
         state.heights = self._heights[0]  # the oldest, of this episode
         actions = policy.act(policy.observation(state, self.command))
         self._motors.begin()
+        self._power[:] = 0.0
         for i in range(self._timing["decimation"]):
             pos, vel = robot.joint_positions(), robot.joint_velocities()
             if i == 0 or self._timing["refresh_torques"]:
                 wanted = policy.wanted_torques(actions, pos, vel)
             robot.step(self._motors.apply(wanted, pos, vel))
+            applied = robot.applied_torques()
+            self._power += np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
+        self._power /= self._timing["decimation"]
         self._steps += 1
 
     def _finish_step(self, command: np.ndarray) -> np.ndarray:
@@ -119,7 +127,6 @@ class Simulation:
         fell = robot.has_fallen()
         ended = fell or self._steps >= self._max_steps
         force = robot.contact_force()
-        power = np.abs(robot.applied_torques() * robot.joint_velocities()).sum()
         if ended:
             self._new_episode()
         elif self._rng.random() < self._commands["resampling_probability"]:
@@ -128,7 +135,7 @@ class Simulation:
             self._push()
         self._follow_heading()
         velocity = robot.planar_velocity()
-        numbers = (np.linalg.norm(velocity[:2]), force, power, robot.height(), fell, ended)
+        numbers = (np.linalg.norm(velocity[:2]), force, *self._power, robot.height(), fell, ended)
         arrays = [command[None], velocity[None], *(np.array([number]) for number in numbers)]
         return step_sums(np, *arrays, tracked=2 if "heading" in self._commands else 3)[:, 0]
 

@@ -39,12 +39,12 @@ class Sensors(dict[str, Sensor]):
         sensing = Sensing(cfg.sensing.delay, state, cfg.sim.dt, cfg.control.decimation)
         self.sensing = sensing if sensing.queue.is_needed else None
 
-    def begin_step(self) -> Callable[[], None] | None:
-        """Begin a control step, and return what must be called after each of its physics steps, if anything."""
+    def begin_step(self) -> list[Callable[[], None]]:
+        """Begin a control step; return what to call after each physics step, if sensors measure then."""
         if not self.sensing:
-            return None
+            return []
         self.sensing.begin()
-        return self.sensing.measure
+        return [self.sensing.measure]
 
     def update_all(self, is_new: Tensor, compilable: bool) -> None:
         """Let those sensors measure that are ``compilable``, or those that are not; see :meth:`Sensor.update`."""

@@ -135,13 +135,13 @@ class Engine(Protocol):
 
     # ---- "torques_in_kernel" -----------------------------------------------------------------------------------------
 
-    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Callable[[], None] | None = None) -> None:
+    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Sequence[Callable[[], None]] = ()) -> None:
         """Advance every world by some physics steps, each under torques of its own; the last one senses.
 
         Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
         which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
-        ``reads`` is an instance of the Warp struct that is the type of the law's first argument. ``after_step``, if
-        given, is called after each of them.
+        ``reads`` is an instance of the Warp struct that is the type of the law's first argument. After each physics
+        step, all of ``after_step`` are called to look at the state.
         """
         raise lacks(self, "torques_in_kernel")
 

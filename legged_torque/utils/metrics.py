@@ -9,7 +9,11 @@ world was reset are left out, but for the count of falls.
 - collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
   control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
   push sideways: 127 N in the nominal pose.
-- cost_of_transport: mean of sum |tau_i qd_i| over m g times mean horizontal speed, with the nominal m g.
+- mechanical_power: mean of sum |tau_i qd_i| over all physics steps [W]. cost_of_transport: this mean over m g times
+  mean horizontal speed, with the nominal m g.
+- electrical_power, electrical_cost: the same with copper losses, mean of sum |tau_i qd_i| + c_i tau_i^2 [W], if
+  ``control.copper_loss`` gives c = R / (gear Kt)^2 [W/(N m)^2]: the current is tau / (gear Kt), and its heat I^2 R.
+  No source gives R and Kt of Unitree's motors, so that a number for them is an assumption.
 - height: mean height of the trunk's origin above the ground [m]. speed: mean horizontal speed [m/s].
 - falls_per_minute: resets that are not time-outs, per minute of one robot.
 """
@@ -33,12 +37,15 @@ UNITS = {
     "track_angular": "rad^2/s^2",
     "collision_force": "N",
     "cost_of_transport": "",
+    "mechanical_power": "W",
+    "electrical_power": "W",
+    "electrical_cost": "",
     "height": "m",
     "speed": "m/s",
     "falls_per_minute": "1/min",
 }
 """Units of the metrics, by their names in files and on the terminal; each has its formula in :func:`ratios`."""
-NUM_SUMS = 10  # numbers that step_sums returns for each world
+NUM_SUMS = 11  # numbers that step_sums returns for each world
 
 
 @dataclass
@@ -68,6 +75,7 @@ def step_sums(
     speed: Array,
     force: Array,
     power: Array,
+    copper: Array,
     height: Array,
     fell: Array,
     ended: Array,
@@ -82,7 +90,8 @@ def step_sums(
         velocity: Of the trunk in its own frame after the step: v_x, v_y [m/s], yaw rate [rad/s]. Shape: (worlds, 3).
         speed: Horizontal speed of the trunk [m/s]. Shape: (worlds,).
         force: Sum over geoms of the norm of the ground's force [N]. Shape: (worlds,).
-        power: Sum over joints of |torque times velocity| [W]. Shape: (worlds,).
+        power: Sum over joints of |torque times velocity|, mean over physics steps [W]. Shape: (worlds,).
+        copper: Heat in the windings, likewise [W]. Shape: (worlds,).
         height: Of the trunk's origin above the ground [m]. Shape: (worlds,).
         fell: Whether the episode ended with the step, but not by its time. Shape: (worlds,), bool.
         ended: Whether it ended at all; then nothing but the fall counts. Shape: (worlds,), bool.
@@ -90,30 +99,34 @@ def step_sums(
 
     Returns:
         Shape: (:data:`NUM_SUMS`, worlds): steps, tracking percentage, steps with a command, xy, angular, force, power,
-        height, speed, falls.
+        copper, height, speed, falls.
     """
     error = abs(commands - velocity)
     percentage, is_commanded = tracking_percentage(xp, error[:, :tracked], commands[:, :tracked])
     one, zero = xp.ones_like(percentage), xp.zeros_like(percentage)
     xy, angular = (error[:, :2] ** 2).sum(axis=1), error[:, 2] ** 2
-    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, power, height, speed, zero])
+    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, power, copper, height, speed, zero])
     rows = xp.where(ended, 0.0, rows)
     rows[-1] = fell
     return rows
 
 
-def ratios(sums: Array, weight: float, control_step: float) -> dict[str, tuple[Array, Array]]:
+def ratios(sums: Array, weight: float, control_step: float, has_losses: bool) -> dict[str, tuple[Array, Array]]:
     """Return numerator and denominator of each metric, per world. Shapes: (worlds,).
 
-    ``sums`` are those of :func:`step_sums`, ``weight`` is the robot's m g [N], and ``control_step`` is in seconds.
+    ``sums`` are those of :func:`step_sums`, ``weight`` is the robot's m g [N], and ``control_step`` is in seconds. A
+    robot that ``has_losses`` has metrics of electrical power, too.
     """
-    steps, percentage, commanded, xy, angular, force, power, height, speed, falls = sums
+    steps, percentage, commanded, xy, angular, force, power, copper, height, speed, falls = sums
+    electrical = {"electrical_power": (power + copper, steps), "electrical_cost": (power + copper, weight * speed)}
     return {
         "track_percentage": (percentage, commanded),
         "track_xy": (xy, steps),
         "track_angular": (angular, steps),
         "collision_force": (force, steps),
         "cost_of_transport": (power, weight * speed),
+        "mechanical_power": (power, steps),
+        **(electrical if has_losses else {}),
         "height": (height, steps),
         "speed": (speed, steps),
         "falls_per_minute": (falls, steps * (control_step / 60.0)),

@@ -26,8 +26,6 @@ VELOCITY_RANGE = 1.6  # of the plots' scale, which grows with larger velocities 
 TORQUE, ANGLE = "{} torque, {:.3g} to {:.3g} N m", "{} angle, {:.2f} to {:.2f} rad"  # with limits
 STRIDE = 2  # control steps per point of a plot
 GAIT_STEPS = HISTORY_STEPS // 2  # control steps in the gait diagram
-METRICS = {**UNITS, "mechanical_power": "W"}  # in the table, with units
-COST, SPEED = (list(UNITS).index(name) for name in ("cost_of_transport", "speed"))
 MEAN_STEPS = 15  # control steps over which present reward terms are means: 0.3 s
 SUM = "sum of all"  # of the reward terms
 WIDTH = 300  # of the panel [pixels]
@@ -99,15 +97,14 @@ class Plots:
         draw(self._reward, time, [shown[:, None]])
 
     def _metrics_table(self) -> str:
-        """Return metrics over the history, as evaluate.py measures them, and the power of the cost of transport."""
-        sessions, columns = [each for each in (self._session, self._session.companion) if each], []
-        for each in sessions:
-            sums = sum((one.metrics for one in list(each.history)), np.zeros((len(UNITS), 2)))
-            sums = np.vstack([sums, [sums[COST, 0], sums[SPEED, 1]]])  # of the power and of steps
+        """Return metrics over the history, as evaluate.py measures them."""
+        sessions = [each for each in (self._session, self._session.companion) if each]
+        histories, rows = [list(each.history) for each in sessions], list[Row]()
+        for name in histories[0][0].metrics:
+            sums = [sum((one.metrics.get(name, np.zeros(2)) for one in past), np.zeros(2)) for past in histories]
             with np.errstate(divide="ignore", invalid="ignore"):
-                columns.append([f"{value:.3g}" for value in sums[:, 0] / sums[:, 1]])
-        names = [f"{name.replace('_', ' ')} {unit and f'[{unit}]'}" for name, unit in METRICS.items()]
-        rows = [(name, "", texts) for name, *texts in zip(names, *columns, strict=True)]
+                texts = [f"{above / below:.3g}" for above, below in sums]
+            rows.append((f"{name.replace('_', ' ')} {UNITS[name] and f'[{UNITS[name]}]'}", "", texts))
         head = f"<b>Metrics, last {HISTORY_STEPS * self._session.task.dt:g} s</b>"
         return table_html((head, "", ["actual", "companion"][: len(sessions)]), *rows)
 

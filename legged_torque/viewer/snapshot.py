@@ -33,7 +33,7 @@ class Snapshot:
     torque_parts: np.ndarray  # the same by weighted action term, see WatchedRobot; (terms, num_dof)
     targets: np.ndarray  # joint positions wanted by PD control [rad]; (num_dof,), empty without PD control
     rewards: np.ndarray  # weighted reward terms of this step, per second; (terms,)
-    metrics: np.ndarray  # numerator and denominator of each metric in this step, see WalkingMetrics; (metrics, 2)
+    metrics: dict[str, np.ndarray]  # numerator and denominator of each metric in this step, see WalkingMetrics; (2,)
     feet: np.ndarray  # 1 for each foot on the ground, else 0; (feet,)
     forces: np.ndarray  # of the ground on the collision geoms, in the world [N]; (geoms, 3)
     tile: tuple[int, int] | None  # level and column of the tile; None on a plane
@@ -78,6 +78,7 @@ class WatchedRobot(LeggedRobot):
             tile = int(self.terrain.levels[world]), int(self.terrain.columns[world])
             scan = self._watched_scan.points()[world]
             scan[:, 2] = self.terrain.height(scan)
+        ratios = self._metrics.ratios()
         names, targets = [term.name for term in self.control_law.terms], self.actions[:, :0]
         if PD_CONTROL in names:
             place = names.index(PD_CONTROL)
@@ -91,14 +92,15 @@ class WatchedRobot(LeggedRobot):
             "torque_parts": self.torque_parts[:, world],
             "targets": targets[world],
             "rewards": self.rewards.terms[:, world] / self.dt,
-            "metrics": torch.stack([torch.stack(pair)[:, world] for pair in self._metrics.ratios().values()]),
+            "metrics": torch.stack([torch.stack(pair)[:, world] for pair in ratios.values()]),
             "feet": self.feet_contact[world],
             "forces": self.sim.contact_force[world],
             "scan": scan,
         }
         arrays = {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
+        metrics = dict(zip(ratios, arrays.pop("metrics"), strict=True))
         falls, age = int((self.reset_buf & ~self.time_out_buf).sum()), int(self.episode_length_buf[world])
-        return Snapshot(time, world, falls=falls, age=age, tile=tile, **arrays)
+        return Snapshot(time, world, metrics=metrics, falls=falls, age=age, tile=tile, **arrays)
 
 
 def watched(task_class: type[LeggedRobot]) -> type[WatchedRobot]:

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -16,6 +17,7 @@ from legged_torque.deploy.description import check
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation, quaternion
+from legged_torque.utils.metrics import ratios
 from legged_torque.viewer import video
 
 
@@ -156,6 +158,30 @@ def test_pushes(policy, monkeypatch, factor):
         assert np.std(draws, axis=0) == pytest.approx(largest / math.sqrt(3.0), rel=0.1), "uniform"
 
 
+def test_power_of_all_physics_steps(policy, monkeypatch):
+    """Work and heat are those of all physics steps of a plain MuJoCo loop with the same torques."""
+    copper, applied, own = np.linspace(0.1, 0.3, 12), [], policy.torques
+    by_joint = dict(zip(policy.joint_order, copper.tolist(), strict=True))
+    monkeypatch.setitem(policy.description, "copper_loss", by_joint)
+    check(policy.description)
+    monkeypatch.setattr(policy, "torques", lambda *values: applied.append(own(*values)) or applied[-1])
+    robot = MujocoRobot(XML, policy.description)
+    simulation, data = Simulation(policy, robot), mujoco.MjData(robot.model)
+    simulation.run(0, 1)
+    data.qpos[:], data.qvel[:] = robot.data.qpos, robot.data.qvel
+    sums = sum(simulation._control_step() or simulation._finish_step(simulation.command) for _ in range(20))
+    work = heat = 0.0
+    for torques in applied:
+        data.ctrl[:] = torques
+        mujoco.mj_step(robot.model, data)
+        work += np.abs(torques * data.qvel[6:]).sum() / 4
+        heat += copper @ torques**2 / 4
+    assert sums[0] == 20 and len(applied) == 80 and work > 1.0
+    of = ratios(sums, 1.0, 0.02, simulation.has_losses)
+    power, total = of["mechanical_power"][0], of["electrical_power"][0]
+    assert (power, total) == pytest.approx((work, work + heat), rel=1e-9)
+
+
 def test_episodes_end(policy):
     """After 20 s, or with the trunk on the ground, an episode starts anew; such steps count only as falls."""
     robot = MujocoRobot(XML, policy.description)
@@ -164,11 +190,11 @@ def test_episodes_end(policy):
     simulation.run(0, 1)
     robot.reset(*random_state(1, height=0.03))
     simulation._control_step()
-    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 9 + [1.0]
+    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 10 + [1.0]
     assert robot.position[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
     simulation._control_step()
     simulation._steps = 1000
-    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 10
+    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 11
     assert simulation._steps == 0
 
 

@@ -6,21 +6,26 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.control import CONVERGED
+from support.control import CONVERGED, pd_by_hand
+from support.settings import torques_in_torch
 from support.simulator import WEIGHT, contacts_by_hand
 
 from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, measure
 from legged_torque.utils.metrics import UNITS, estimate, step_sums
 
+STATE = ("qpos", "qvel", "qacc_warmstart")
 RANGES = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-2.0, 0.0], "ang_vel_yaw": [0.5, 2.5]}
 STILL = {f"domain_rand.init_{angle}": [0.0, 0.0] for angle in ("roll", "pitch", "yaw")}
+COPPER = {"hip": 0.3, "joint": 0.1}  # [W/(N m)^2]
+COPPER_OF_JOINTS = np.array([0.3, 0.1, 0.1] * 4)
 STILL |= {"domain_rand.init_dof_pos_scale": [1.0, 1.0]}
 
 
 @pytest.fixture(scope="module")
 def task(make_task):
     """Worlds whose tensors a test writes; they take no steps."""
-    return make_task("a1_position", 5, **{f"commands.ranges.{name}": limits for name, limits in RANGES.items()})
+    ranges = {f"commands.ranges.{name}": limits for name, limits in RANGES.items()}
+    return make_task("a1_position", 5, **ranges, **{"control.copper_loss": COPPER})
 
 
 def random_steps(count, worlds, geoms, seed=0):
@@ -48,6 +53,9 @@ def add(task, metrics, **step):
     places |= {"reset": task.reset_buf, "time_out": task.time_out_buf}
     for name, place in places.items():
         place.copy_(torch.as_tensor(step.get(name, 0)))
+    after_step = task.power.begin()
+    for _ in range(4 if after_step else 0):  # physics steps, all alike
+        after_step()
     metrics.add_step(torch.as_tensor(step["commands"], dtype=torch.float32))
 
 
@@ -75,10 +83,14 @@ def sums_by_hand(steps, dt):
             x, y, yaw = now["commands"]
             speed = math.hypot(vx, vy)
             power = sum(abs(tau * v) for tau, v in zip(now["torques"], now["joint_vel"], strict=True))
+            heat = sum(c * tau**2 for tau, c in zip(now["torques"], COPPER_OF_JOINTS, strict=True))
             result["track_xy"][:, w] += (vx - x) ** 2 + (vy - y) ** 2, 1.0
             result["track_angular"][:, w] += (yaw_rate - yaw) ** 2, 1.0
             result["collision_force"][:, w] += sum(math.sqrt(f @ f) for f in now["force"]), 1.0
             result["cost_of_transport"][:, w] += power, WEIGHT * speed
+            result["mechanical_power"][:, w] += power, 1.0
+            result["electrical_cost"][:, w] += power + heat, WEIGHT * speed
+            result["electrical_power"][:, w] += power + heat, 1.0
             result["height"][:, w] += now["height"], 1.0
             result["speed"][:, w] += speed, 1.0
             result["falls_per_minute"][1, w] += dt / 60.0
@@ -141,9 +153,10 @@ def test_lying_robots_against_mujoco(make_task):
     task.base_pos[:, 2] = torch.tensor([0.12, 0.12, 0.10])
     task.base_quat.copy_(torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.5**0.5, 0.5**0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]))
     data, metrics = mujoco.MjData(model), WalkingMetrics(task)
+    assert not {"electrical_power", "electrical_cost"} & set(metrics.means()), "without copper losses"
     expected, touching = np.zeros((150, 3)), np.zeros((3, sim.contact_found.shape[1]), bool)
     for t in range(150):
-        before = [getattr(sim, name).numpy().copy() for name in ("qpos", "qvel", "qacc_warmstart")]
+        before = [getattr(sim, name).numpy().copy() for name in STATE]
         task.step(torch.zeros(3, 12))
         metrics.add_step(task.commands)
         for w in range(3):
@@ -157,6 +170,41 @@ def test_lying_robots_against_mujoco(make_task):
     assert steps.tolist() == [150.0] * 3
     np.testing.assert_allclose(force / steps, expected.mean(axis=0), rtol=2e-3)
     assert (touching.sum(axis=1) >= 4).all() and touching[:, 0].any()
+
+
+@pytest.mark.parametrize(("name", "torques"), [("a1_position", pd_by_hand), ("a1_torque", lambda a, q, qd: 8.0 * a)])
+def test_power_of_all_physics_steps(make_task, name, torques):
+    """Work and heat are those of a plain MuJoCo loop over the physics steps, in the kernel and with torques in torch.
+
+    Measured worlds go on as others do to the bit, which take one launch per control step.
+    """
+    settings = {**CONVERGED, "control.copper_loss": COPPER, "env.episode_length_s": 1e3}
+    plain, *measured = (make_task(name, 2, **settings) for _ in range(3))
+    torques_in_torch(measured[1])
+    walking = [WalkingMetrics(task) for task in measured]
+    data, rng = mujoco.MjData(plain.sim.mj_model), np.random.default_rng(0)
+    expected = np.zeros((2, 2))
+    for _ in range(12):
+        actions, before = rng.normal(size=(2, 12)), [getattr(plain.sim, part).numpy().copy() for part in STATE]
+        for task in (plain, *measured):
+            task.step(torch.tensor(actions, dtype=torch.float32))
+        assert not plain.reset_buf.any()
+        for world in range(2):
+            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (values[world] for values in before)
+            for _ in range(4):
+                data.ctrl[:] = np.clip(torques(actions[world], data.qpos[7:], data.qvel[6:]), -33.5, 33.5)
+                mujoco.mj_step(plain.sim.mj_model, data)
+                heat = COPPER_OF_JOINTS @ data.ctrl**2
+                expected[:, world] += np.abs(data.ctrl * data.qvel[6:]).sum() / 4, heat / 4
+        assert all(torch.equal(getattr(plain.sim, part), getattr(measured[0].sim, part)) for part in STATE)
+        for part in STATE:
+            getattr(measured[1].sim, part).copy_(getattr(plain.sim, part))  # rounding errors do not add up
+        for each in walking:
+            each.add_step(plain.commands)
+    for each in walking:
+        ratios = each.ratios()
+        work, total = (ratios[name][0].numpy() for name in ("mechanical_power", "electrical_power"))
+        np.testing.assert_allclose([work, total - work], expected, rtol=2e-3)
 
 
 def test_breakdown_by_hand(task):
@@ -225,7 +273,7 @@ def test_arrays_and_tensors_give_the_same():
     generator = torch.Generator().manual_seed(5)
     commands, velocity = (torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     commands[:10, 1], commands[10:20] = 0.0, 0.0
-    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(4)]
+    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(5)]
     ended = torch.arange(50) % 7 == 0
     fell = ended & (torch.arange(50) % 2 == 0)
     batch = step_sums(torch, commands, velocity, *parts, fell, ended).numpy()

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.evaluation import WalkingEvaluation
+from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.compiled import compiled
 from legged_torque.sim.engine import Engine
@@ -35,6 +36,7 @@ class BaseTask(VecEnv):
 
     Attributes:
         state: The state of the robots.
+        power: What their motors draw, see :meth:`measure_power`.
         obs_buf: Groups of observations: "policy" and "critic", each (num_envs, size), and others of a task's own.
         rew_buf: Rewards of the last step. Shape: (num_envs,).
         total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
@@ -48,6 +50,7 @@ class BaseTask(VecEnv):
     sim: Engine
     terrain: Terrain
     state: RobotState
+    power: PowerMeter
     obs_buf: TensorDict
     num_processes = 1
     _parts: Sequence[Callable[[], None]] = ()
@@ -131,6 +134,11 @@ class BaseTask(VecEnv):
     def keep_final_observations(self, value: bool) -> None:
         """Say whether they do; the step is captured anew."""
         self._keeps_final, self._final = value, {}
+        self.step_graph.reset()
+
+    def measure_power(self) -> None:
+        """Let :attr:`power` measure all steps from now on; the step is captured anew."""
+        self.power.is_on = True
         self.step_graph.reset()
 
     @property

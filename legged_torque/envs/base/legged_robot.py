@@ -17,6 +17,7 @@ from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
+from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.random_parameters import (
     control_parameters,
@@ -170,9 +171,9 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """Do the physics steps of a control step, with torques inside of them where that is possible."""
         self.motors.send(self.actions)
         decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
-        measure = self.sensors.begin_step()
+        after_step = self.power.begin() + self.sensors.begin_step()
         if self._torque_kernel and not self._is_overridden():
-            self.sim.drive(decimation, *self._torque_kernel, measure)
+            self.sim.drive(decimation, *self._torque_kernel, after_step)
             return
         pos, vel = self.dof_pos, self.dof_vel
         for i in range(decimation):
@@ -180,8 +181,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
                 wanted = self._compute_torques(self.motors.actions(pos, vel, i))
             self.torques.copy_(self.motors.apply(wanted, pos, vel, i))
             self.sim.step(sense=i == decimation - 1)
-            if measure:
-                measure()
+            for look in after_step:
+                look()
 
     def _is_overridden(self) -> bool:
         """Return whether torques are computed by another method than that of this class."""
@@ -333,6 +334,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         cfg.env.num_actions = self.num_actions
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
         self._use_attributes_of(self.state)
+        self.power = PowerMeter(self.state, cfg.control, self.dof_names)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)

@@ -199,6 +199,7 @@ class LeggedRobotCfg(BaseConfig):
         damping: Gains = 0.0  # [N m s/rad] Kd; of all joints, or by a part of their names
         action_scale: Positive = 0.25  # [rad] per unit of a position action
         torque_scale: Positive = 1.0  # [N m] per unit of a torque action
+        copper_loss: Gains = 0.0  # [W/(N m)^2] of the electrical metrics; of all joints, or by a part of their names
 
     class rewards:  # the terms of Table III; each is a method ``_reward_<term>``
         only_positive_rewards: bool = True  # clip the sum at 0 from below

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.engine import Engine
 from legged_torque.utils import metrics
@@ -24,9 +25,13 @@ class WalkingTask(Protocol):
     cfg: Any
     sim: Engine
     state: RobotState
+    power: PowerMeter
     num_envs: int
     device: str
     dt: float
+
+    def measure_power(self) -> None:
+        """Let ``power`` measure all steps from now on."""
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world, and return the observations."""
@@ -41,6 +46,7 @@ class WalkingMetrics:
     def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
+        task.measure_power()
         model = task.sim.mj_model
         self.weight = float(model.body_mass.sum()) * abs(float(model.opt.gravity[2]))
         self._sums = torch.zeros(metrics.NUM_SUMS, task.num_envs, device=task.device)
@@ -54,7 +60,7 @@ class WalkingMetrics:
 
         Only in the worlds that are ``counted``, if it is given. Shape: (num_envs,), bool.
         """
-        state = self._task.state
+        state, power = self._task.state, self._task.power
         velocity = state.planar_velocity()
         sums = metrics.step_sums(
             torch,
@@ -62,7 +68,8 @@ class WalkingMetrics:
             velocity,
             speed=velocity[:, :2].norm(dim=1),
             force=state.contact_force.norm(dim=2).sum(dim=1),
-            power=(state.torques * state.dof_vel).abs().sum(dim=1),
+            power=power.mechanical,
+            copper=power.copper,
             height=state.base_height,
             fell=state.reset_buf & ~state.time_out_buf,
             ended=state.reset_buf,
@@ -72,7 +79,7 @@ class WalkingMetrics:
 
     def ratios(self) -> dict[str, tuple[Tensor, Tensor]]:
         """Return numerator and denominator of each metric, per world. Shapes: (num_envs,)."""
-        return metrics.ratios(self._sums, self.weight, self._task.dt)
+        return self._ratios(self._sums)
 
     def means(self) -> dict[str, float]:
         """Return the metrics over all steps and worlds; NaN where nothing was measured. Waits once for the device."""
@@ -83,7 +90,11 @@ class WalkingMetrics:
     def estimates(self) -> dict[str, metrics.Estimate]:
         """Return the metrics with standard errors."""
         sums = self._sums.double().cpu().numpy()
-        return metrics.estimates(metrics.ratios(sums, self.weight, self._task.dt))
+        return metrics.estimates(self._ratios(sums))
+
+    def _ratios(self, sums: Any) -> dict[str, tuple[Any, Any]]:
+        """Return the ratios of sums, which are a tensor or an array."""
+        return metrics.ratios(sums, self.weight, self._task.dt, self._task.power.has_losses)
 
 
 class CommandBreakdown:

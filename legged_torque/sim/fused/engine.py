@@ -68,7 +68,7 @@ class FusedEngine(WarpEngine):
         """Launch one physics step."""
         self._launch(range(1), sense, None, 0)
 
-    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Callable[[], None] | None = None) -> None:
+    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Sequence[Callable[[], None]] = ()) -> None:
         """Launch some physics steps under a control law.
 
         On a GPU each step is a launch: within one, worlds drift apart, and threads at different places of this long
@@ -77,8 +77,8 @@ class FusedEngine(WarpEngine):
         step_by_step = [range(i, i + 1) for i in range(steps)]
         for part in step_by_step if self._wp_device.is_cuda or after_step else [range(steps)]:
             self._launch(part, part.stop == steps, law, reads)
-            if after_step:
-                after_step()
+            for look in after_step:
+                look()
 
     def _launch(self, steps: range, sense: bool, law: wp.Function | None, reads: Any) -> None:
         """Run the kernel for some steps, the last of which may sense."""

@@ -1,0 +1,51 @@
+"""Power of the motors, as means over the physics steps of a control step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.base.state import RobotState
+from legged_torque.motors.joints import by_joint
+
+
+class PowerMeter:
+    """Adds up what the motors do in each physics step; a sample after the last one can be far from the mean.
+
+    In a physics step a torque is constant, and MuJoCo turns the joint by its new velocity times the step: the work is
+    torque times new velocity times the step. Braking counts as driving, since nothing says that a battery takes it.
+
+    Attributes:
+        is_on: Whether steps are measured; trainings do without. See :meth:`BaseTask.measure_power`.
+        mechanical: Sum over joints of |torque times velocity| [W]; NaN before the first step. Shape: (num_envs,).
+        copper: Heat in the windings, sum over joints of copper_loss times squared torque [W]. Shape: (num_envs,).
+        copper_loss: Heat per squared torque of each joint [W/(N m)^2]. Shape: (num_dof,).
+        has_losses: Whether any joint has copper losses.
+    """
+
+    is_on = False
+
+    def __init__(self, state: RobotState, control: type[LeggedRobotCfg.control], dof_names: Sequence[str]) -> None:
+        """Take decimation and losses of the section ``control``; errors of :func:`by_joint`."""
+        self._state, self._share = state, 1.0 / control.decimation
+        losses = by_joint("control.copper_loss", control.copper_loss, dof_names)
+        self.copper_loss, self.has_losses = torch.tensor(losses, device=state.device), any(losses)
+        self.mechanical = torch.full((state.num_envs,), torch.nan, device=state.device)
+        self.copper = torch.zeros_like(self.mechanical)
+
+    def begin(self) -> list[Callable[[], None]]:
+        """Begin a control step; return what to call after each physics step, if it is measured."""
+        if not self.is_on:
+            return []
+        self.mechanical.zero_()
+        self.copper.zero_()
+        return [self._add_step]
+
+    def _add_step(self) -> None:
+        """Add the physics step that has just been made."""
+        torques, vel = self._state.torques, self._state.dof_vel
+        self.mechanical.add_((torques * vel).abs().sum(dim=1), alpha=self._share)
+        if self.has_losses:
+            self.copper.add_(torques.square() @ self.copper_loss, alpha=self._share)
