@@ -160,12 +160,13 @@ def test_pushes(policy, monkeypatch, factor):
 
 def test_power_of_all_physics_steps(policy, monkeypatch):
     """Work and heat are those of all physics steps of a plain MuJoCo loop with the same torques."""
-    copper, applied, own = np.linspace(0.1, 0.3, 12), [], policy.torques
+    copper, applied = np.linspace(0.1, 0.3, 12), []
     by_joint = dict(zip(policy.joint_order, copper.tolist(), strict=True))
     monkeypatch.setitem(policy.description, "copper_loss", by_joint)
     check(policy.description)
-    monkeypatch.setattr(policy, "torques", lambda *values: applied.append(own(*values)) or applied[-1])
     robot = MujocoRobot(XML, policy.description)
+    step = robot.step
+    monkeypatch.setattr(robot, "step", lambda torques: applied.append(torques.copy()) or step(torques))
     simulation, data = Simulation(policy, robot), mujoco.MjData(robot.model)
     simulation.run(0, 1)
     data.qpos[:], data.qvel[:] = robot.data.qpos, robot.data.qvel
