@@ -30,6 +30,7 @@ from legged_torque.deploy.description import (
 from legged_torque.deploy.policy import OBSERVATIONS, Policy, State, load_network, parts_without_function
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.delay import ActionDelay
 from legged_torque.motors.motor import Motor
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.sensors.height_scan import CLIP, OFFSET
@@ -58,7 +59,6 @@ def nominal_cfg(cfg: Any) -> Any:
     """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
-    cfg.motors.delay.range = [0, 0]
     return cfg
 
 
@@ -226,11 +226,25 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
     }
     if task.power.has_losses:
         description["copper_loss"] = _by_joint(task, task.power.copper_loss)
+    if latency := _latency(task, description["motors"]):
+        description["latency"] = latency
     if others := _not_simulated(task):
         description["episode"]["not_simulated"] = others
     if cfg.terrain.mesh_type == "heightfield":
         description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
     return description
+
+
+def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:
+    """Return what is late, and take the delay of actions out of the constants of motors."""
+    latency: dict[str, Any] = {}
+    delays = [name for name, link in task.motors.links.items() if type(link) is ActionDelay and name in motors]
+    if len(delays) == 1:
+        latency["actions"] = motors.pop(delays[0])
+    if task.sensors.sensing:
+        settings: Any = task.cfg.sensing.delay
+        latency["measurements"] = settings.described()
+    return latency
 
 
 def _not_simulated(task: LeggedRobot) -> list[str]:

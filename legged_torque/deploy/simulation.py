@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from legged_torque.deploy.latency import Latency
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import MotorTwin
@@ -63,6 +65,7 @@ class Simulation:
         ranges = [self._commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
         self._command_range = np.array([command, command] if command else np.transpose(ranges), float)
         self._heights = deque[np.ndarray](maxlen=1 + (policy.scan["delay"] if policy.scan else 0))
+        self._actions, self._measurements = (Latency(description, name) for name in ("actions", "measurements"))
         self._push_set_factor, self.notes = pushes.get("set_factor", 1.0), list[str]()
         if push_probability and not pushes:
             self.notes.append(
@@ -104,20 +107,25 @@ class Simulation:
     def _control_step(self) -> None:
         """Observe, act, and apply torques in all physics steps of a control step; keep their mean power [W]."""
         policy, robot = self.policy, self.robot
-        state = robot.state()
+        is_late = self._measurements.is_needed
+        state = dataclasses.replace(self._measurements.received(self._now)) if is_late else robot.state()
         places = policy.scan_places(robot.position, robot.quat)
         self._heights.append(robot.position[2] - robot.ground_heights(places))
         state.heights = self._heights[0]  # the oldest, of this episode
-        actions = policy.act(policy.observation(state, self.command))
+        self._actions.send(self._now, policy.act(policy.observation(state, self.command)))
         self._motors.begin()
         self._power[:] = 0.0
         for i in range(self._timing["decimation"]):
             pos, vel = robot.joint_positions(), robot.joint_velocities()
             if i == 0 or self._timing["refresh_torques"]:
+                actions = self._actions.received(self._now)
                 wanted = policy.wanted_torques(actions, pos, vel)
             robot.step(self._motors.apply(wanted, pos, vel))
             applied = robot.applied_torques()
             self._power += np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
+            self._now += 1
+            if is_late:
+                self._measurements.send(self._now, robot.state())
         self._power /= self._timing["decimation"]
         self._steps += 1
 
@@ -159,7 +167,9 @@ class Simulation:
         self._motors.reset()
         self._draw_command()
         self._heights.clear()
-        self._steps = 0
+        self._steps = self._now = 0
+        self._actions.restart(self._rng, self.policy.last_action.copy())
+        self._measurements.restart(self._rng, self.robot.state())
 
     def _drawn(self, limits: list[float], size: int | None = None) -> Any:
         """Return one or ``size`` numbers that are drawn uniformly from [lowest, highest]."""

@@ -9,7 +9,7 @@ TASK = "a1_torque_curriculum"  # the one with the most reward terms
 WORLDS, STEPS = 3, 10
 RANDOM = {"domain_rand.randomize_parameters": True}
 FIXED = {"domain_rand.randomize_parameters": False}
-HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6], "sensing.delay.range": [1, 3]}
+HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6], "sensing.delay.range": [1, 6]}
 BUFFERS = {
     "stiffness": lambda task: task.p_gains,
     "damping": lambda task: task.d_gains,
@@ -32,7 +32,7 @@ DRAWN_BUFFERS = {
 DELAYED_BUFFERS = {
     "delay.drawn": lambda task: task.motors.links["delay"].queue.drawn,
     "delay.before": lambda task: task.motors.links["delay"].queue.before[:, 0],
-    "sensing.newest": lambda task: task.sensors.sensing.queue.newest,
+    "sensing.before": lambda task: task.sensors.sensing.queue.before[:, 0],
     "observation_history": lambda task: task.obs_buf["policy"][:, -1:],
 }
 
