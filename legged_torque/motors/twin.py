@@ -76,7 +76,7 @@ class MotorTwin:
 
 def without_function(described: dict[str, Any]) -> bool:
     """Return whether a motor of ``policy.yaml`` is of a model that is not known here."""
-    return described.get("model") not in FORMULAS
+    return str(described.get("model")) not in FORMULAS
 
 
 def _constants(cfg: ModelCfg, given: dict[str, Any], names: list[str], path: str) -> dict[str, np.ndarray]:
