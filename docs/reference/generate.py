@@ -31,12 +31,15 @@ from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-MODELS = ("Motors", "Model", "Curve", "Drive", "Lag", "Friction", "Thermal", "Quantize")
+LINKS = ("Drive", "Lag", "Friction", "Thermal", "Quantize")
+SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
+SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
+"""Where the settings of some classes stand."""
 CONFIGS = (
     (legged_robot_config, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
     (commands_config, "CommandsCfg"),
-    *((model_config, f"{name}Cfg") for name in MODELS),
+    *((model_config, f"{name}Cfg") for name in ("Motors", "Model", "Curve", *LINKS)),
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
@@ -203,7 +206,7 @@ def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
     bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
     text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
     table = ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
-    section = "commands." if name == "CommandsCfg" else ""
+    section = SECTIONS.get(name, "")
     table += rows(node, getattr(module, name), section, source, comments(source), known)
     return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
-from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg, FrictionCfg
+from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 
 
 class G1Cfg(LeggedRobotCfg):
@@ -33,7 +33,7 @@ class G1Cfg(LeggedRobotCfg):
         torque_scale = 10.0
 
     class motors:
-        choices = {"ideal": ["delay", "ideal"], "real": ["delay", "ideal", "unitree", "unitree_friction"]}
+        choices = {"ideal": ["delay", "ideal"], "real": ["delay", "ideal", "unitree", "friction"]}
 
         class unitree(CurveCfg):
             """By type of motor, of unitree_rl_lab: N7520-22.5, N7520-14.3, and two N5020-16 for each ankle joint."""
@@ -44,7 +44,7 @@ class G1Cfg(LeggedRobotCfg):
             braking_torque = {"hip_roll": 131.0, "knee": 131.0, "hip": 83.3, "ankle": 2 * 31.9}
             draws = ASSUMED_VOLTAGE
 
-        class unitree_friction(FrictionCfg):
+        class friction:
             """Of the same motors, but smoother: with Unitree's 0.01 rad/s, joints tremble in physics steps of 5 ms."""
 
             static_friction = {"hip_roll": 2.4, "knee": 2.4, "hip": 1.6, "ankle": 2 * 0.6}
