@@ -39,6 +39,22 @@ def launches(task):
 # ------------------------------------------------------------------------------------------------ the simulator
 
 
+MODELS = {
+    "motors.chain": ["delay", "drive", "ideal", "lag", "urdf", "friction", "thermal"],
+    "motors.delay.range": [0, 3],
+    "motors.drive.damping": 0.5,
+    "motors.lag.time_constant": 0.005,
+    "motors.urdf.knee_speed": 5.0,
+    "motors.urdf.sag": 2.0,
+    "motors.friction.coulomb_friction": 0.5,
+    "motors.friction.activation_speed": 0.5,
+    "motors.thermal.continuous_torque": 10.0,
+    "motors.thermal.time_constant": 0.1,
+    "domain_rand.randomize_parameters": True,
+}
+"""A chain of models with state, and a drawn voltage."""
+
+
 @wp.struct
 class Springs:
     """What the next function reads."""
@@ -97,6 +113,7 @@ def test_simulator_drives():
         ("a1_multihead", {"motors.delay.range": [1, 2], "motors.delay.unit": "control_steps"}),
         ("a1_torque_multihead", {"motors.delay.range": [2, 6]}),
         ("a1_multihead_two_rates", {"motors.delay.range": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
+        ("a1_torque", MODELS),
     ],
 )
 def test_as_in_torch(make_task, name, settings):
