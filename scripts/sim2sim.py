@@ -68,7 +68,7 @@ def main() -> None:
     """Load a policy and a robot, simulate, print the metrics, and write JSON and video if asked to."""
     args = parse_args()
     no_renderer = None if args.viewer else choose_offscreen_renderer()
-    options = cli.options_of(args)  # imports files of tasks, which may add numpy functions of their terms
+    cli.options_of(args)  # imports files of tasks, which may add numpy functions of their terms
     with cli.slow_imports():
         import numpy as np
 
@@ -83,8 +83,9 @@ def main() -> None:
     args.policy = args.policy or last_export(Path(args.log_root or LOGS))
     policy = Policy(args.policy)
     if args.motors:
-        env_cfg, _ = task_registry.get_cfgs(policy.description["task"], options)
-        policy.description["motors"] = env_cfg.motors.describe()
+        motors = task_registry.get_cfgs(policy.description["task"])[0].motors
+        motors.choose(args.motors)
+        policy.description["motors"] = motors.describe()
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])

@@ -104,6 +104,10 @@ class QuantizeCfg(ModelCfg):
     resolution: PositivePerJoint = 0.01  # [N m]
 
 
+MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg)}
+"""Settings by the name of the model."""
+
+
 class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 

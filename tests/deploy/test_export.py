@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from support.control import REAL_MOTORS
 from support.exports import TRAINING, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
@@ -40,20 +41,14 @@ CHANGED = {
     "normalization.obs_scales.dof_vel": 0.3,
 }
 """Settings that all differ from what they are by default."""
-MOTORS = {
-    "motors.chain": ["delay", "drive", "ideal", "lag", "urdf", "friction", "thermal", "quantize"],
-    "motors.drive.damping": {"hip": 0.3, "thigh": 0.0, "calf": 0.5},
-    "motors.lag.time_constant": 0.003,
-    "motors.urdf.knee_speed": 2.0,
-    "motors.urdf.sag": 20.0,
-    "motors.friction.static_friction": 0.8,
-    "motors.thermal.continuous_torque": 5.0,
-    "motors.thermal.time_constant": 0.05,
-    "motors.quantize.resolution": 1e-6,
-}
-"""Motors of all models; steps of torques are so small that rounding errors do not become whole steps."""
 ONCE = {"control.refresh_torques": False}
-SETTINGS = {"default": {}, "changed": CHANGED, "torques_once": ONCE, "motors": MOTORS, "motors_once": MOTORS | ONCE}
+SETTINGS = {
+    "default": {},
+    "changed": CHANGED,
+    "torques_once": ONCE,
+    "motors": REAL_MOTORS,
+    "motors_once": REAL_MOTORS | ONCE,
+}
 
 
 def scramble(task, generator):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.control import TORQUE_LIMIT, pd_by_hand
+from support.control import REAL_MOTORS, TORQUE_LIMIT, pd_by_hand
 from support.episodes import HIGH_UP, time_out
 from support.fused import compiled, make_walker, random
 from support.settings import torques_in_torch
@@ -37,22 +37,6 @@ def launches(task):
 
 
 # ------------------------------------------------------------------------------------------------ the simulator
-
-
-MODELS = {
-    "motors.chain": ["delay", "drive", "ideal", "lag", "urdf", "friction", "thermal"],
-    "motors.delay.range": [0, 3],
-    "motors.drive.damping": 0.5,
-    "motors.lag.time_constant": 0.005,
-    "motors.urdf.knee_speed": 5.0,
-    "motors.urdf.sag": 2.0,
-    "motors.friction.coulomb_friction": 0.5,
-    "motors.friction.activation_speed": 0.5,
-    "motors.thermal.continuous_torque": 10.0,
-    "motors.thermal.time_constant": 0.1,
-    "domain_rand.randomize_parameters": True,
-}
-"""A chain of models with state, and a drawn voltage."""
 
 
 @wp.struct
@@ -113,7 +97,7 @@ def test_simulator_drives():
         ("a1_multihead", {"motors.delay.range": [1, 2], "motors.delay.unit": "control_steps"}),
         ("a1_torque_multihead", {"motors.delay.range": [2, 6]}),
         ("a1_multihead_two_rates", {"motors.delay.range": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
-        ("a1_torque", MODELS),
+        ("a1_torque", REAL_MOTORS | {"motors.delay.range": [0, 3], "domain_rand.randomize_parameters": True}),
     ],
 )
 def test_as_in_torch(make_task, name, settings):
