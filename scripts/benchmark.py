@@ -60,7 +60,7 @@ def main() -> None:
         cli.check_output(file)
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
-    result |= {"ranges": args.ranges or "default", "set": without_machine(args.set)}
+    result |= {"ranges": args.ranges or "default", "motors": args.motors or "default", "set": without_machine(args.set)}
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")

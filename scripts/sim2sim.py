@@ -16,7 +16,7 @@ from pathlib import Path
 
 from legged_torque import resource_path
 from legged_torque.deploy.description import DESCRIPTION_FILE
-from legged_torque.envs import LeggedRobotCfg
+from legged_torque.envs import LeggedRobotCfg, task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, printable
@@ -49,7 +49,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--video", type=Path, help="mp4 of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
-    cli.add_options(parser, "task_file", "log_root")
+    cli.add_options(parser, "motors", "task_file", "log_root")
     args = parser.parse_args()
     cli.check_args(args, steps=Count, robots=Count, seed=Number, command=list[float])
     cli.check_args(args, push_velocity=NotNegative, push_probability=Share)
@@ -82,6 +82,10 @@ def main() -> None:
         from legged_torque.viewer.video import SimulationRecorder
     args.policy = args.policy or last_export(Path(args.log_root or LOGS))
     policy = Policy(args.policy)
+    if args.motors:
+        motors = task_registry.get_cfgs(policy.description["task"])[0].motors
+        motors.choose(args.motors)
+        policy.description["motors"] = motors.describe()
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])

@@ -24,16 +24,22 @@ from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
+from legged_torque.motors import model_config
 from legged_torque.sim.engine import Engine
 from legged_torque.utils.limits import describe, types_of
 from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
+LINKS = ("Drive", "Lag", "Friction", "Thermal", "Quantize")
+SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
+SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
+"""Where the settings of some classes stand."""
 CONFIGS = (
     (legged_robot_config, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
     (commands_config, "CommandsCfg"),
+    *((model_config, f"{name}Cfg") for name in ("Motors", "Model", "Curve", *LINKS)),
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
@@ -169,6 +175,8 @@ def rows(
                 result.append(f"| **`{path}{statement.name}`** | | | {text.splitlines()[0].replace('``', '`')} |")
             result += rows(statement, getattr(cls, statement.name), f"{path}{statement.name}.", source, notes, known)
         for name, node_of_value in assignments(statement):
+            if name.startswith("_"):
+                continue
             value = " ".join((ast.get_source_segment(source, node_of_value) or "").split())
             value = value if len(value) <= 60 else f"{value[:57]}..."
             before = known.get(f"{path}{name}", known.get(name, ""))
@@ -198,7 +206,7 @@ def settings_table(module: ModuleType, name: str, known: dict[str, str]) -> str:
     bases = ", ".join(f"`{ast.unparse(base)}`" for base in node.bases)
     text = " ".join(re.sub(r":\w+:`~?[\w.]*?(\w+)`", r"`\1`", ast.get_docstring(node) or "").replace("``", "`").split())
     table = ["| setting | default | allowed | meaning |", "|---|---|---|---|"]
-    section = "commands." if name == "CommandsCfg" else ""
+    section = SECTIONS.get(name, "")
     table += rows(node, getattr(module, name), section, source, comments(source), known)
     return "\n".join([f"## {name}", "", f"{text} Base: {bases}.", "", *table, ""])
 

@@ -20,6 +20,10 @@ class MotorCfg(Section):
         """Return the :class:`~legged_torque.motors.motor.Motor` of :class:`~legged_torque.motors.joints.Joints`."""
         return pkgutil.resolve_name(self._motor_class)(self, joints)
 
+    def describe(self) -> dict[str, Any]:
+        """Return model and constants for ``policy.yaml``; no model if there is no numpy function for it."""
+        return {}
+
 
 class LatencyCfg(Section):
     """Settings of packets that are late: a constant time per world, and what each packet adds to it."""
@@ -61,6 +65,10 @@ class IdealCfg(MotorCfg):
     """Settings of :class:`~legged_torque.motors.ideal.IdealMotor`: any torque within the limits, at once."""
 
     _motor_class = "legged_torque.motors.ideal:IdealMotor"
+
+    def describe(self) -> dict[str, Any]:
+        """Return the name of the model; ``policy.yaml`` has its limits anyway."""
+        return {"model": "ideal"}
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:

@@ -42,5 +42,5 @@ class IdealMotor(Motor):
         return read(TorqueLimits, limits=self.joints.torque_limits)
 
     def describe(self) -> dict[str, Any]:
-        """Return its name; ``policy.yaml`` has the limits anyway."""
-        return {"model": "ideal"}
+        """Return the name of the model."""
+        return self.cfg.describe()

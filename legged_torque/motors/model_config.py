@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
-from legged_torque.motors.config import MotorCfg, by_joint
-from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.motors.config import DelayCfg, MotorCfg, by_joint
+from legged_torque.utils.config import Section, section_keys, to_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import DrawLimits, Interval, Limits
 
@@ -14,7 +14,8 @@ PerJoint = Annotated[float | dict[str, float], Limits(lowest=0)]
 PositivePerJoint = Annotated[float | dict[str, float], Limits(above=0)]
 SharePerJoint = Annotated[float | dict[str, float], Limits(0, 1)]
 Draws = dict[str, Annotated[dict[Literal["set", "add", "scale"], Interval], DrawLimits()]]
-UNLIMITED = 1e9
+ASSUMED_VOLTAGE: Draws = {"voltage": {"set": [0.85, 1.05]}}
+"""Shares of the nominal voltage that batteries are assumed to have; no source gives those of these robots."""
 
 
 class ModelCfg(MotorCfg):
@@ -40,13 +41,13 @@ class ModelCfg(MotorCfg):
 
 
 class CurveCfg(ModelCfg):
-    """Settings of :func:`~legged_torque.motors.formulas.curve`: at which speed a motor has which torque."""
+    """Settings of :func:`~legged_torque.motors.formulas.curve`: how much torque at which speed; as they are, any."""
 
     _model = "curve"
-    knee_speed: PerJoint = UNLIMITED  # [rad/s] X1, up to which a motor has its whole torque
-    no_load_speed: PerJoint = UNLIMITED  # [rad/s] X2, at which it has none
-    driving_torque: PerJoint = UNLIMITED  # [N m] Y1, most with the motion
-    braking_torque: PerJoint = UNLIMITED  # [N m] Y2, most against it
+    knee_speed: PerJoint = 1e9  # [rad/s] X1, up to which a motor has its whole torque
+    no_load_speed: PerJoint = 1e9  # [rad/s] X2, at which it has none
+    driving_torque: PerJoint = 1e9  # [N m] Y1, most with the motion
+    braking_torque: PerJoint = 1e9  # [N m] Y2, most against it
     voltage: PerJoint = 1.0  # of the bus, as a share of the nominal one
     sag: PerJoint = 0.0  # [1/kW] share of the voltage lost per mechanical power of all joints
 
@@ -91,7 +92,7 @@ class ThermalCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.thermal`: less torque for motors that were loaded for long."""
 
     _model = "thermal"
-    continuous_torque: PositivePerJoint = UNLIMITED  # [N m] RMS that a motor bears for any time
+    continuous_torque: PositivePerJoint = 1e9  # [N m] RMS that a motor bears for any time
     time_constant: PositivePerJoint = 60.0  # [s]
     derating_from: SharePerJoint = 0.8  # share of the continuous torque
 
@@ -101,3 +102,39 @@ class QuantizeCfg(ModelCfg):
 
     _model = "quantize"
     resolution: PositivePerJoint = 0.01  # [N m]
+
+
+MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg)}
+"""Settings by the name of the model."""
+
+
+class MotorsCfg(Section):
+    """Named chains of links, and links that act only in a chain that lists them."""
+
+    choices: dict[str, list[str]] = {"ideal": ["delay", "ideal"]}  # chains by name, for ``--motors``
+
+    class drive(DriveCfg):  # gains that the drive itself closes
+        pass
+
+    class lag(LagCfg):  # torques rise in a while
+        pass
+
+    class friction(FrictionCfg):  # in addition to that of the robot's file
+        pass
+
+    class thermal(ThermalCfg):  # less torque after a long load
+        pass
+
+    class quantize(QuantizeCfg):  # steps of torques
+        pass
+
+    def choose(self, name: str) -> None:
+        """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
+        if name not in self.choices:
+            raise unknown_name("motors", name, self.choices)
+        self.chain = list(self.choices[name])
+
+    def describe(self) -> dict[str, dict[str, Any]]:
+        """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""
+        links = {name: getattr(self, name) for name in self.chain}
+        return {name: link.describe() for name, link in links.items() if not isinstance(link, DelayCfg)}

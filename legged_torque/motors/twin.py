@@ -8,20 +8,9 @@ from typing import Any
 import numpy as np
 
 from legged_torque.motors.formulas import FORMULAS
-from legged_torque.motors.model_config import (
-    CurveCfg,
-    DriveCfg,
-    FrictionCfg,
-    LagCfg,
-    ModelCfg,
-    QuantizeCfg,
-    ThermalCfg,
-)
+from legged_torque.motors.model_config import MODELS
 from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.errors import UserError
-
-SETTINGS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, FrictionCfg, LagCfg, QuantizeCfg, ThermalCfg)}
-"""Settings by model: they check the constants in a file."""
 
 
 class MotorTwin:
@@ -42,12 +31,12 @@ class MotorTwin:
         robot |= {"nominal_pose": np.array([description["nominal_pose"][name] for name in names], np.float32)}
         self._links = []
         for link, described in (description.get("motors") or {"ideal": {"model": "ideal"}}).items():
-            constants, model = dict(described), described.get("model")
             if without_function(described):
                 raise UserError(f"no numpy function for the motor '{link}'")
-            del constants["model"]
-            values = _constants(SETTINGS[model](), constants, names, f"motors.{link}") if model in SETTINGS else {}
-            self._links.append((FORMULAS[model], SimpleNamespace(**robot, **values)))
+            motor, model = SimpleNamespace(**robot), described["model"]
+            if model in MODELS:
+                vars(motor).update(_constants(described, names, f"motors.{link}"))
+            self._links.append((FORMULAS[model], motor))
         self._shape = (len(names),)
         self.reset()
 
@@ -76,11 +65,12 @@ class MotorTwin:
 
 def without_function(described: dict[str, Any]) -> bool:
     """Return whether a motor of ``policy.yaml`` is of a model that is not known here."""
-    return described.get("model") not in FORMULAS
+    return str(described.get("model")) not in FORMULAS
 
 
-def _constants(cfg: ModelCfg, given: dict[str, Any], names: list[str], path: str) -> dict[str, np.ndarray]:
+def _constants(described: dict[str, Any], names: list[str], path: str) -> dict[str, np.ndarray]:
     """Return constants by name; a UserError names those that do not exist or make no sense. Shapes: (joints,)."""
-    update_from_dict(cfg, given, path)
+    cfg = MODELS[described["model"]]()
+    update_from_dict(cfg, {name: value for name, value in described.items() if name != "model"}, path)
     cfg.check(path)
     return {name: np.array(values, np.float32) for name, values in cfg.constants(names, path).items()}

@@ -28,12 +28,12 @@ from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
 COMMAND = "legged-torque"  # the console command that runs every script
-SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "task_file")  # options of every task
+SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file")  # options of every task
 RUNS = ("load_run", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
 TRAINING = ("max_iterations", "resume", "preset", "run_name", "logger", "verbose")  # of trainings alone
 _GROUPS = {"task and settings": ("task", "num_envs", *SETTINGS[1:]), "training": TRAINING, "runs": RUNS}
 _TASK_OF_RUN = f"name of the task, see train.py --list; default: that of the run, or {DEFAULT_TASK} for a new one"
-_COMPLETED = ("task", "preset", "perturbation", "ranges", "set", "terrain")
+_COMPLETED = ("task", "preset", "perturbation", "ranges", "motors", "set", "terrain")
 _SCRIPT = re.compile(r"python scripts/(\w+)\.py")
 _EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``\.")
 
@@ -154,6 +154,7 @@ def complete(action: argparse.Action, parsed_args: argparse.Namespace, **_: Any)
         "preset": train_cfg.presets(),
         "perturbation": env_cfg.perturbations(),
         "ranges": env_cfg.parameter_ranges(),
+        "motors": env_cfg.motors.choices,
         "set": [f"{path}=" for path in flat(to_dict(env_cfg) | to_dict(train_cfg))],
         "terrain": ["all", *section_keys(env_cfg.terrain.terrain_proportions)],
     }

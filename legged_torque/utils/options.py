@@ -47,6 +47,10 @@ class Options:
     ranges: str | None = _option(
         "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
     )
+    motors: str | None = _option(
+        "models of the motors: ideal, real, or another of the robot's motors.choices; default: those of the task, or "
+        "what a loaded run has"
+    )
     task_file: list[str] = _option(
         "Python file that registers tasks of your own, which runs as your code; may be repeated", [], metavar="FILE"
     )
@@ -77,7 +81,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     """Change settings as the options say; a UserError names a value that is not allowed.
 
     The more explicit wins: a preset is overridden by the settings of a loaded run ("env" and "train" of
-    ``run_config``), these by the perturbation and ranges, then by single options, then by ``set``.
+    ``run_config``), these by perturbation, ranges and motors, then by single options, then by ``set``.
     """
     for name, hint in types_of(Options).items():
         if isinstance(getattr(options, name), int):
@@ -93,6 +97,8 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:
         update_from_dict(env_cfg, _named("ranges", options.ranges, env_cfg.parameter_ranges()))
+    if options.motors:
+        env_cfg.motors.choose(options.motors)
     paths = ("env.num_envs", "seed", "runner.experiment_name", "runner.run_name", "runner.logger")
     changes = [(path, value) for path in paths if (value := getattr(options, path.rpartition(".")[2])) is not None]
     for item in options.set:

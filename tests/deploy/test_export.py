@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from support.control import REAL_MOTORS
 from support.exports import TRAINING, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import TASKS, error_of, torques_in_torch
@@ -22,6 +23,7 @@ from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.motors.config import MotorCfg
 from legged_torque.motors.motor import Motor
+from legged_torque.motors.twin import MotorTwin
 
 CHANGED = {
     "env.history_length": 3,
@@ -39,7 +41,14 @@ CHANGED = {
     "normalization.obs_scales.dof_vel": 0.3,
 }
 """Settings that all differ from what they are by default."""
-SETTINGS = {"default": {}, "changed": CHANGED, "torques_once": {"control.refresh_torques": False}}
+ONCE = {"control.refresh_torques": False}
+SETTINGS = {
+    "default": {},
+    "changed": CHANGED,
+    "torques_once": ONCE,
+    "motors": REAL_MOTORS,
+    "motors_once": REAL_MOTORS | ONCE,
+}
 
 
 def scramble(task, generator):
@@ -63,14 +72,16 @@ def read_yaml(folder):
 
 TWO_RATES = "a1_multihead_two_rates"
 PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
+MORE_PARITY = [("a1_torque_multihead", settings) for settings in ("torques_once", "motors", "motors_once")]
 
 
-@pytest.mark.parametrize(("name", "settings"), [*PARITY, ("a1_torque_multihead", "torques_once")])
+@pytest.mark.parametrize(("name", "settings"), [*PARITY, *MORE_PARITY])
 def test_parity(make_task, tmp_path, name, settings):
     """Observations, actions and torques are the task's to 1e-5, over several steps of random states and commands."""
     overrides = SETTINGS[settings] | {"commands.resampling_probability": 1.0}
     task, model = export_random(make_task, name, tmp_path / "out", settings == "changed", **overrides)
     policies = [Policy(tmp_path / "out") for _ in range(task.num_envs)]
+    motors = [MotorTwin(policy.description) for policy in policies]
     generator = torch.Generator().manual_seed(8)
     physics_steps = []  # of the current control step: positions, velocities and torques of all joints
 
@@ -85,8 +96,8 @@ def test_parity(make_task, tmp_path, name, settings):
     for step in range(8):
         if step in (0, 5):
             obs = task.reset()
-            for policy in policies:
-                policy.reset()
+            for one in (*policies, *motors):
+                one.reset()
         ours = [p.observation(measured(task, i), task.commands[i].numpy()) for i, p in enumerate(policies)]
         np.testing.assert_allclose(ours, obs["policy"].numpy(), **close)
         largest = max(largest, float(obs["policy"].abs().max()))
@@ -96,11 +107,16 @@ def test_parity(make_task, tmp_path, name, settings):
         actions = [p.act(o) for p, o in zip(policies, ours, strict=True)]
         np.testing.assert_allclose(actions, task.actions.numpy(), **close)
         assert len(physics_steps) == task.cfg.control.decimation
+        for twin in motors:
+            twin.begin()
         for q, qd, torques in physics_steps:
-            if settings == "torques_once":
-                q, qd = physics_steps[0][:2]
-            ours = [p.torques(*parts) for p, *parts in zip(policies, actions, q, qd, strict=True)]
-            np.testing.assert_allclose(ours, torques, **close)
+            start = physics_steps[0][:2] if settings.endswith("once") else (q, qd)
+            wanted = [p.wanted_torques(*parts) for p, *parts in zip(policies, actions, *start, strict=True)]
+            ours = [twin.apply(*parts) for twin, *parts in zip(motors, wanted, q, qd, strict=True)]
+            if settings.startswith("motors"):
+                np.testing.assert_allclose(ours, torques, atol=1e-3)  # derating multiplies rounding errors
+            else:
+                np.testing.assert_allclose(ours, torques, **close)
     if settings == "changed":
         assert largest == 1.5 and np.abs(actions).max() == pytest.approx(0.2)  # both were clipped
         assert obs["policy"].shape[1] == 3 * (33 + task.num_actions + (name == TWO_RATES))  # and its phase

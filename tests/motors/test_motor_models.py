@@ -7,32 +7,25 @@ import torch
 import warp as wp
 from support.settings import error_of
 
+from legged_torque.envs import task_registry
 from legged_torque.motors import models
 from legged_torque.motors.joints import Joints
-from legged_torque.motors.twin import SETTINGS, MotorTwin
+from legged_torque.motors.model_config import MODELS
+from legged_torque.motors.twin import MotorTwin
 from legged_torque.sim.randomization import Randomization
 from legged_torque.utils.config import update_from_dict
+from legged_torque.utils.options import Options
 
 NAMES = ["hip", "thigh", "calf"]
 WORLDS, STEPS, DECIMATION, DT, PEAK = 40, 6, 2, 0.005, 30.0
 POSE = np.array([0.1, 0.8, -1.5])
 CONSTANTS = {
-    "curve": {
-        "knee_speed": {"hip": 13.5, "thigh": 10.0, "calf": 8.0},
-        "no_load_speed": {"calf": 8.0, "h": 30.0},
-        "driving_torque": 20.2,
-        "braking_torque": 23.4,
-        "sag": 0.5,
-    },
+    "curve": {"knee_speed": {"hip": 13.5, "thigh": 10.0, "calf": 8.0}, "no_load_speed": {"calf": 8.0, "h": 30.0}}
+    | {"driving_torque": 20.2, "braking_torque": 23.4, "sag": 0.5},
     "drive": {"damping": {"hip": 0.5, "thigh": 1.0, "calf": 0.0}, "stiffness": 20.0},
     "lag": {"time_constant": {"hip": 0.0, "thigh": 0.002, "calf": 0.02}},
-    "friction": {
-        "static_friction": 2.4,
-        "coulomb_friction": 1.6,
-        "viscous_friction": 0.16,
-        "load_friction": 0.05,
-        "activation_speed": 0.5,
-    },
+    "friction": {"static_friction": 2.4, "coulomb_friction": 1.6, "viscous_friction": 0.16}
+    | {"load_friction": 0.05, "activation_speed": 0.5},
     "thermal": {"continuous_torque": {"hip": 5.0, "thigh": 12.0, "calf": 40.0}, "time_constant": 0.02},
     "quantize": {"resolution": {"hip": 0.5, "thigh": 0.01, "calf": 3.0}},
 }
@@ -77,19 +70,22 @@ def joints(worlds=WORLDS):
 
 def settings(model, **constants):
     """Settings of a model."""
-    cfg = SETTINGS[model]()
+    cfg = MODELS[model]()
     update_from_dict(cfg, constants, "motors.own")
     cfg.check("motors.own")
     return cfg
 
 
-def described(model, constants):
+def described(motors, pose=POSE, names=NAMES, peak=PEAK):
     """What the twin reads of ``policy.yaml``."""
-    by_joint = {"torque_limits": [-PEAK, PEAK]}
-    description = {key: dict.fromkeys(NAMES, value) for key, value in by_joint.items()}
-    description |= {"joint_order": NAMES, "nominal_pose": dict(zip(NAMES, POSE.tolist(), strict=True))}
+    description = {"joint_order": names, "nominal_pose": dict(zip(names, pose, strict=True)), "motors": motors}
     description["timing"] = {"decimation": DECIMATION, "physics_frequency": 1.0 / DT}
-    return description | {"motors": {"own": {"model": model, **constants}}}
+    return description | {"torque_limits": {name: [-peak, peak] for name in names}}
+
+
+def twin_of(model, constants):
+    """One motor in numpy."""
+    return MotorTwin(described({"own": {"model": model, **constants}}))
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -136,7 +132,7 @@ def computed():
         {model: settings(model, **own).build(joints()) for model, own in CONSTANTS.items()} for _ in range(2)
     )
     reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(6, WORLDS, 3)
-    twins = {model: [MotorTwin(described(model, own)) for _ in range(WORLDS)] for model, own in CONSTANTS.items()}
+    twins = {model: [twin_of(model, own) for _ in range(WORLDS)] for model, own in CONSTANTS.items()}
     for step in range(STEPS):
         inputs = [torch.tensor(values[step]) for values in (wanted, pos, vel)]
         if step % DECIMATION == 0:
@@ -174,7 +170,7 @@ def test_as_mujoco_s_dc_motor():
     data = mujoco.MjData(model)
     knee, no_load = (volts - most * resistance / constant) / constant, volts / constant
     curve = {"knee_speed": knee, "no_load_speed": no_load, "driving_torque": most, "braking_torque": most}
-    twin = MotorTwin(described("curve", curve))
+    twin = twin_of("curve", curve)
     for speed in np.linspace(-40.0, 29.0, 24):
         data.ctrl, data.qvel = volts, speed
         mujoco.mj_forward(model, data)
@@ -188,7 +184,7 @@ def test_energy_of_the_drive():
         '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'
         '<actuator><motor joint="joint"/></actuator></mujoco>'
     )
-    data, twin, lost = mujoco.MjData(model), MotorTwin(described("drive", {"damping": 0.05})), 0.0
+    data, twin, lost = mujoco.MjData(model), twin_of("drive", {"damping": 0.05}), 0.0
     data.qvel = 12.0
     mujoco.mj_forward(model, data)
     start = data.energy[1]
@@ -205,7 +201,7 @@ def test_draws_and_resets():
     cfg = settings("curve", **CONSTANTS["curve"], draws={"voltage": {"set": [0.8, 1.1]}})
     link = cfg.build(joints(200))
     drawn = Randomization(link.random_parameters(), lambda *_: None, 200, "cpu")
-    drawn.seeds.random_()
+    drawn.seeds.random_(generator=torch.Generator().manual_seed(0))
     drawn.draw(torch.ones(200, dtype=torch.bool))
     voltage = link.values.voltage
     assert (voltage == voltage[:, :1]).all() and 0.8 <= voltage.min() < 0.81 and 1.09 < voltage.max() <= 1.1
@@ -215,6 +211,29 @@ def test_draws_and_resets():
     torch.testing.assert_close(torques[:, 0], expected[:, 0])
     link.reset(torch.arange(200) < 100)
     assert (link.values.power[:100] == 0.0).all() and (link.values.power[100:, 0] > 0.0).any()
+
+
+@pytest.mark.parametrize(
+    ("task", "choice", "joint", "speed", "most"),
+    [
+        ("a1_torque", "real", "FL_hip_joint", 20.9, 33.5),
+        ("go1_torque", "real", "RR_calf_joint", 20.0, 35.55),
+        ("go1_torque", "real", "RR_calf_joint", 20.1, 0.0),
+        ("go2_torque", "real", "RR_calf_joint", 21.75, 20.2 / 2),
+        ("go2_torque", "unitree_train", "RR_calf_joint", -30.0, 23.4),
+        ("go2_torque", "urdf", "RR_calf_joint", 15.6, 45.43),
+        ("g1_position", "real", "left_knee_joint", 14.0, 111.0 - 2.4 - 0.24 * 14.0),
+        ("g1_position", "real", "right_hip_yaw_joint", -30.0, 83.3 + 1.6 + 0.16 * 30.0),
+        ("g1_position", "real", "left_ankle_roll_joint", 30.0, 2 * (24.8 - 0.6 - 0.06 * 30.0)),
+    ],
+)
+def test_choices(task, choice, joint, speed, most):
+    """The motors of a robot have the torques of their sources."""
+    cfg = task_registry.get_cfgs(task, Options(device="cpu", motors=choice))[0]
+    pose = cfg.init_state.default_joint_angles
+    twin = MotorTwin(described(cfg.motors.describe(), list(pose.values()), list(pose), peak=200.0))
+    torques = twin.apply(np.full(len(pose), 1000.0), np.zeros(len(pose)), np.full(len(pose), speed))
+    assert torques[list(pose).index(joint)] == pytest.approx(most, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -232,5 +251,5 @@ def test_refused(model, constants, words):
     """Constants that make no sense are refused by name, in settings and in ``policy.yaml``."""
     lines = [error_of(lambda: settings(model, **constants).build(joints()))]
     if "draws" not in constants:
-        lines.append(error_of(MotorTwin, described(model, constants)))
+        lines.append(error_of(twin_of, model, constants))
     assert all(word in line for word in words for line in lines)

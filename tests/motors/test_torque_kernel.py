@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.control import TORQUE_LIMIT, pd_by_hand
+from support.control import REAL_MOTORS, TORQUE_LIMIT, pd_by_hand
 from support.episodes import HIGH_UP, time_out
 from support.fused import compiled, make_walker, random
 from support.settings import torques_in_torch
@@ -94,6 +94,7 @@ def test_simulator_drives():
         ("a1_multihead", {"motors.delay.range": [1, 2], "motors.delay.unit": "control_steps"}),
         ("a1_torque_multihead", {"motors.delay.range": [2, 6], "motors.delay.jitter": 5, "motors.delay.loss": 0.2}),
         ("a1_multihead_two_rates", {"motors.delay.range": [0, 5], "init_state.pos": [0.0, 0.0, 0.3]}),
+        ("a1_torque", REAL_MOTORS | {"motors.delay.range": [0, 3], "domain_rand.randomize_parameters": True}),
     ],
 )
 def test_as_in_torch(make_task, name, settings):

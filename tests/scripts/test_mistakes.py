@@ -28,6 +28,10 @@ MISTAKES = [
     ("--task=a1_torque_gravity --set=pretraining.file=/proc/x/y.pt", "cannot write '/proc/x/y.pt'"),
     ("--set=obs_groups.actor=[polic]", "did you mean 'policy'?"),
     ("--load_run=2026", "--load_run and --checkpoint need --resume"),
+    (
+        "--motors=real --set=motors.urdf.knee_speed=30",
+        "motors.urdf.knee_speed must be at most motors.urdf.no_load_speed",
+    ),
 ]
 
 
@@ -44,6 +48,7 @@ def test_mistakes_when_training(root, words, message):
     ("script", "words", "message"),
     [
         ("play.py", "--terrain=stairs", "unknown kind of terrain 'stairs'; did you mean 'stairs_up'?"),
+        ("evaluate.py", "--motors=rael", "unknown motors 'rael'; did you mean 'real'? allowed: ideal, real"),
         ("play.py", "--compare=logs", "--compare needs --viewer web"),
         ("play.py", "--level=0.5", "--level needs --terrain: the kinds of rough ground"),
         ("play.py", "--compare=logs --viewer=web", "the run 'logs' has no config.yaml"),

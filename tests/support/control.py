@@ -14,6 +14,19 @@ IN_THE_AIR = {"init_state.pos": [0.0, 0.0, 2.0]}
 CONVERGED = {"sim.solver_iterations": 100, "sim.ls_iterations": 50}
 """Solver limits that neither MuJoCo nor MuJoCo Warp reaches, so that both find the same minimum."""
 
+REAL_MOTORS = {
+    "motors.chain": ["delay", "drive", "ideal", "lag", "urdf", "friction", "thermal"],
+    "motors.drive.damping": {"hip": 0.3, "thigh": 0.0, "calf": 0.5},
+    "motors.lag.time_constant": 0.003,
+    "motors.urdf.knee_speed": 5.0,
+    "motors.urdf.sag": 2.0,
+    "motors.friction.coulomb_friction": 0.5,
+    "motors.friction.activation_speed": 0.5,
+    "motors.thermal.continuous_torque": 10.0,
+    "motors.thermal.time_constant": 0.1,
+}
+"""Settings of an A1's motors with all models whose torques change continuously."""
+
 
 def pd_by_hand(action, q, qd, kp=20.0, kd=0.5, scale=0.25):
     """Eq. 8 in numpy."""

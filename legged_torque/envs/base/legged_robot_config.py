@@ -11,6 +11,7 @@ from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg
+from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import (
@@ -102,7 +103,7 @@ class LeggedRobotCfg(BaseConfig):
             gaps: Share = 0.0  # of up to 1 m
             pits: Share = 0.0  # up to 1 m deep
 
-    class motors:  # from actions to the torques that joints get: a link is a section with a method ``build``
+    class motors(MotorsCfg):  # from actions to the torques that joints get: a link is a section with a method ``build``
         chain: list[str] = ["delay", "ideal"]  # links in order: those of actions, then those of torques
 
         class delay(DelayCfg):  # time from the policy to the motors

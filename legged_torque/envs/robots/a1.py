@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 
 
 class A1Cfg(LeggedRobotCfg):
@@ -30,6 +31,16 @@ class A1Cfg(LeggedRobotCfg):
         damping = 0.5
         action_scale = 0.25
         torque_scale = 4.0
+
+    class motors:
+        choices = {"ideal": ["delay", "ideal"], "real": ["delay", "ideal", "urdf"]}
+
+        class urdf(CurveCfg):  # Unitree's URDF, which has no knee: the whole torque up to the highest speed
+            knee_speed = 21.0
+            no_load_speed = 21.0
+            driving_torque = 33.5
+            braking_torque = 33.5
+            draws = ASSUMED_VOLTAGE
 
     class domain_rand:
         trunk_mass = {"add": [-1.0, 1.0]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 
 
 class G1Cfg(LeggedRobotCfg):
@@ -30,6 +31,26 @@ class G1Cfg(LeggedRobotCfg):
         damping = {"hip": 2.0, "knee": 4.0, "ankle": 2.0}
         action_scale = 0.25
         torque_scale = 10.0
+
+    class motors:
+        choices = {"ideal": ["delay", "ideal"], "real": ["delay", "ideal", "unitree", "friction"]}
+
+        class unitree(CurveCfg):
+            """By type of motor, of unitree_rl_lab: N7520-22.5, N7520-14.3, and two N5020-16 for each ankle joint."""
+
+            knee_speed = {"hip_roll": 14.5, "knee": 14.5, "hip": 22.63, "ankle": 30.86}
+            no_load_speed = {"hip_roll": 22.7, "knee": 22.7, "hip": 35.52, "ankle": 40.13}
+            driving_torque = {"hip_roll": 111.0, "knee": 111.0, "hip": 71.0, "ankle": 2 * 24.8}
+            braking_torque = {"hip_roll": 131.0, "knee": 131.0, "hip": 83.3, "ankle": 2 * 31.9}
+            draws = ASSUMED_VOLTAGE
+
+        class friction:
+            """Of the same motors, but smoother: with Unitree's 0.01 rad/s, joints tremble in physics steps of 5 ms."""
+
+            static_friction = {"hip_roll": 2.4, "knee": 2.4, "hip": 1.6, "ankle": 2 * 0.6}
+            coulomb_friction = {"hip_roll": 2.4, "knee": 2.4, "hip": 1.6, "ankle": 2 * 0.6}
+            viscous_friction = {"hip_roll": 0.24, "knee": 0.24, "hip": 0.16, "ankle": 2 * 0.06}
+            activation_speed = 0.1
 
     class domain_rand:
         init_roll = [-0.1, 0.1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 
 
 class Go1Cfg(LeggedRobotCfg):
@@ -30,6 +31,16 @@ class Go1Cfg(LeggedRobotCfg):
         damping = 0.5
         action_scale = 0.25
         torque_scale = 4.0
+
+    class motors:
+        choices = {"ideal": ["delay", "ideal"], "real": ["delay", "ideal", "urdf"]}
+
+        class urdf(CurveCfg):  # Unitree's URDF, which has no knee: the whole torque up to the highest speed
+            knee_speed = {"calf": 20.06, "joint": 30.1}
+            no_load_speed = {"calf": 20.06, "joint": 30.1}
+            driving_torque = {"calf": 35.55, "joint": 23.7}
+            braking_torque = {"calf": 35.55, "joint": 23.7}
+            draws = ASSUMED_VOLTAGE
 
     class rewards:
         base_height_target = 0.325
