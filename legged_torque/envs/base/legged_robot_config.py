@@ -107,8 +107,8 @@ class LeggedRobotCfg(BaseConfig):
         chain: list[str] = ["delay", "ideal"]  # links in order: those of actions, then those of torques
 
         class delay(DelayCfg):  # time from the policy to the motors
-            range, unit = [0, 0], "physics_steps"  # of all times; drawn at every reset
-            jitter, loss = 0, 0.0  # of each control step: by up to how much it is later, and the share that is lost
+            range, unit = [0, 0], "physics_steps"  # drawn at every reset; the unit of all times
+            jitter, loss = 0, 0.0  # of each control step: longest further time, and share that is lost
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
@@ -116,7 +116,7 @@ class LeggedRobotCfg(BaseConfig):
     class sensing:  # from the robot's own sensors, joint encoders and IMU, to the policy
         class delay(LatencyCfg):  # of the measurement of each physics step; the critic sees the present
             range, unit = [0, 0], "physics_steps"  # as of ``motors.delay``
-            jitter, loss = 0, 0.0  # of each physics step
+            jitter, loss = 0, 0.0  # of each measurement
 
     class sensors:  # sensors by name: a sensor is a section with a method ``build``
         pass
