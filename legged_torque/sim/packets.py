@@ -145,7 +145,7 @@ class Queue:
 @wp.func
 def received_packet(queue: Queue, world: int, elapsed: int) -> wp.array[float]:
     """Return what :meth:`PacketQueue.received` does, for one world."""
-    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e4)) * queue.unit_steps - elapsed
+    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e6)) * queue.unit_steps - elapsed
     age = int(wp.clamp((missing + queue.interval - 1) // queue.interval, 0, queue.depth))
     for packet in range(age, queue.extra.shape[1] - 1):  # type: ignore[attr-defined]
         if packet == age and float(missing - packet * queue.interval) + queue.extra[world, packet] > 0.0:
