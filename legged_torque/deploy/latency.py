@@ -27,24 +27,17 @@ class Latency:
 
     def restart(self, rng: np.random.Generator, packet: Any) -> None:
         """Draw a constant time for a new episode, in which the receiver has a packet from the start on."""
-        self._rng, self._held, self._sent = rng, packet, 0
-        self._on_the_way: list[tuple[int, int, Any]] = []  # arrival, number, packet
+        self._rng, self._queue = rng, [(0, packet)]  # arrival and packet; what the receiver has is the first
         self._constant = int(rng.integers(self._times[0], self._times[1] + 1)) if self.is_needed else 0
 
     def send(self, now: int, packet: Any) -> None:
         """Send a packet, which may get lost."""
-        self._sent += 1
-        extra, is_lost = 0, False
-        if self.is_needed:
-            extra, is_lost = int(self._rng.integers(0, self._jitter + 1)), self._rng.random() < self._loss
-        if not is_lost:
-            arrival = now + (self._constant + extra) * self._unit_steps
-            self._on_the_way.append((arrival, self._sent, packet))
+        extra = int(self._rng.integers(0, self._jitter + 1)) if self.is_needed else 0
+        if not (self.is_needed and self._rng.random() < self._loss):
+            self._queue.append((now + (self._constant + extra) * self._unit_steps, packet))
 
     def received(self, now: int) -> Any:
         """Return the newest packet that has arrived."""
-        arrived = [(number, packet) for arrival, number, packet in self._on_the_way if arrival <= now]
-        if arrived:
-            newest, self._held = max(arrived, key=lambda entry: entry[0])
-            self._on_the_way = [entry for entry in self._on_the_way if entry[1] > newest]
-        return self._held
+        newest = max(i for i, (arrival, _) in enumerate(self._queue) if arrival <= now)
+        self._queue = self._queue[newest:]
+        return self._queue[0][1]

@@ -18,19 +18,19 @@ class Sensing:
     are those of :class:`~legged_torque.envs.base.state.RobotState`.
 
     Attributes:
-        projected_gravity, base_ang_vel, dof_pos, dof_vel: What has arrived.
+        base_ang_vel, dof_pos, dof_vel: What has arrived.
         queue: The measurements on their way: trunk orientation, dof_pos, base_ang_vel and dof_vel.
     """
 
     def __init__(self, cfg: LatencyCfg, state: RobotState, dt: float, decimation: int) -> None:
         """Allocate room for the longest delay; a UserError if it is not a whole number of physics steps."""
         self._state, num_dof = state, state.dof_pos.shape[1]
-        self._sizes, self._measured = (4, num_dof, 3, num_dof), 0
+        self._measured = 0
         times, jitter, unit_steps = cfg.counted("sensing.delay", dt, decimation)
         self.queue = PacketQueue(self._packet(), 1, times, unit_steps, jitter, cfg.loss)
-        self.projected_gravity = torch.zeros_like(state.projected_gravity)
-        self.base_ang_vel = torch.zeros_like(state.base_ang_vel)
-        self.dof_pos, self.dof_vel = torch.zeros_like(state.dof_pos), torch.zeros_like(state.dof_vel)
+        self._arrived = torch.zeros_like(self._packet())
+        parts = self._arrived.split((4, num_dof, 3, num_dof), dim=1)
+        self._quat, self.dof_pos, self.base_ang_vel, self.dof_vel = parts
         self._gravity = torch.tensor([[0.0, 0.0, -1.0]], device=state.device)
 
     def begin(self) -> None:
@@ -53,11 +53,12 @@ class Sensing:
 
     def look(self) -> None:
         """Write what has arrived."""
-        quat, dof_pos, base_ang_vel, dof_vel = self.queue.received().split(self._sizes, dim=1)
-        self.projected_gravity.copy_(quat_rotate_inverse(quat, self._gravity))
-        self.base_ang_vel.copy_(base_ang_vel)
-        self.dof_pos.copy_(dof_pos)
-        self.dof_vel.copy_(dof_vel)
+        self._arrived.copy_(self.queue.received())
+
+    @property
+    def projected_gravity(self) -> Tensor:
+        """That of the orientation that has arrived."""
+        return quat_rotate_inverse(self._quat, self._gravity)
 
     def _packet(self) -> Tensor:
         """Return a measurement of this moment. Shape: (num_envs, 7 + 2 num_dof)."""

@@ -85,7 +85,7 @@ class PacketQueue(Buffers):
         self.newest = self.buffer("newest", width) if self.is_needed else like
         self.before, self.drawn = self.buffer("before", self.depth, width), self.buffer("drawn", 1)
         self.extra = self.buffer("extra", self.depth + 1) if jitter else torch.zeros_like(self.drawn)
-        self._sent_at = -interval * torch.arange(self.depth + 1, device=like.device)
+        self._ages = torch.arange(self.depth + 1, device=like.device)
         seeds = self.num_envs if jitter or loss else 0
         self.seeds = torch.zeros(seeds, dtype=torch.int32, device=like.device)
 
@@ -106,8 +106,8 @@ class PacketQueue(Buffers):
         """Return the packet that the receiver has some physics steps after the newest was sent. Shape: as of it."""
         if not self.depth:
             return self.newest
-        arrival = self._sent_at + self.drawn.floor() * self.unit_steps + self.extra
-        age = (arrival > elapsed).long().cumprod(dim=1).sum(dim=1).clamp(max=self.depth)  # NaN has arrived
+        arrival = self.drawn.floor() * self.unit_steps + self.extra - self.interval * self._ages
+        age = torch.where(arrival > elapsed, self.depth, self._ages).amin(dim=1)  # NaN has arrived
         history = torch.cat([self.newest.unsqueeze(1), self.before], dim=1)
         return history.gather(1, age.view(-1, 1, 1).expand(-1, 1, history.shape[2])).squeeze(1)
 
@@ -145,7 +145,7 @@ class Queue:
 @wp.func
 def received_packet(queue: Queue, world: int, elapsed: int) -> wp.array[float]:
     """Return what :meth:`PacketQueue.received` does, for one world."""
-    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e4)) * queue.unit_steps - elapsed
+    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e6)) * queue.unit_steps - elapsed
     age = int(wp.clamp((missing + queue.interval - 1) // queue.interval, 0, queue.depth))
     for packet in range(age, queue.extra.shape[1] - 1):  # type: ignore[attr-defined]
         if packet == age and float(missing - packet * queue.interval) + queue.extra[world, packet] > 0.0:

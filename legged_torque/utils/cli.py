@@ -23,12 +23,13 @@ from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
 from legged_torque.utils.files import write_errors
-from legged_torque.utils.limits import check_value, describe, types_of
+from legged_torque.utils.limits import Rate, check_value, describe, types_of
 from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
 COMMAND = "legged-torque"  # the console command that runs every script
-SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file")  # options of every task
+CLOCKS = ("policy_hz", "physics_hz")
+SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file", *CLOCKS)  # of every task
 RUNS = ("load_run", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
 TRAINING = ("max_iterations", "resume", "preset", "run_name", "logger", "verbose")  # of trainings alone
 _GROUPS = {"task and settings": ("task", "num_envs", *SETTINGS[1:]), "training": TRAINING, "runs": RUNS}
@@ -137,7 +138,10 @@ def add_options(parser: Parser, *names: str) -> None:
             elif hint == list[str]:
                 how["action"] = "append"
             elif hint not in (str, str | None):
-                how |= {"type": int, "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}"}
+                how |= {
+                    "type": float if hint == Rate | None else int,
+                    "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}",
+                }
             if name == "task" and "load_run" in names:
                 how |= {"default": "", "help": _TASK_OF_RUN}
             if aliases := how.pop("aliases", ()):

@@ -8,7 +8,7 @@ from typing import Any
 
 from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import Count, Number, Worlds, check_value, types_of
+from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value, types_of
 from legged_torque.utils.successors import successor
 
 DEFAULT_PRESET = "parallel"
@@ -51,6 +51,8 @@ class Options:
         "models of the motors: ideal, real, or another of the robot's motors.choices; default: those of the task, or "
         "what a loaded run has"
     )
+    policy_hz: Rate | None = _option("control steps per second; default: 50, or those of the task or the loaded run")
+    physics_hz: Rate | None = _option("physics steps per second; default: 200, or those of the task or the loaded run")
     task_file: list[str] = _option(
         "Python file that registers tasks of your own, which runs as your code; may be repeated", [], metavar="FILE"
     )
@@ -81,10 +83,10 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     """Change settings as the options say; a UserError names a value that is not allowed.
 
     The more explicit wins: a preset is overridden by the settings of a loaded run ("env" and "train" of
-    ``run_config``), these by perturbation, ranges and motors, then by single options, then by ``set``.
+    ``run_config``), these by the clocks, then by perturbation, ranges and motors, single options, and ``set``.
     """
     for name, hint in types_of(Options).items():
-        if isinstance(getattr(options, name), int):
+        if isinstance(getattr(options, name), (int, float)):
             check_value(f"--{name}", getattr(options, name), hint)
     for section, values in _named("preset", options.preset or DEFAULT_PRESET, train_cfg.presets()).items():
         update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
@@ -93,6 +95,8 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
             if not isinstance(run_config[part], dict):
                 raise UserError(f"config key '{part}' is a section with entries, not the value {run_config[part]!r}")
             update_from_dict(cfg, cfg.upgraded(run_config[part]))
+    if options.policy_hz or options.physics_hz:
+        train_cfg.set_clock(env_cfg.set_clocks(options.policy_hz, options.physics_hz))
     if options.perturbation:
         apply_perturbation(env_cfg, options.perturbation)
     if options.ranges:

@@ -8,6 +8,9 @@ from legged_torque.utils.task_registry import set_seed
 
 WORDS = ["--task=a1_torque_multihead", "--num_envs=512", "--perturbation=low", "--set=runner.num_steps_per_env=8"]
 WORDS += ["--set=algorithm.num_mini_batches=2", "--set=algorithm.num_learning_epochs=2", "--set=evaluation.interval=0"]
+WORDS += [
+    f"--set={way}.delay.{time}" for way in ("motors", "sensing") for time in ("range=[0, 3]", "jitter=2", "loss=0.1")
+]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from legged_torque.utils.progress import TORCH_COMPILES
 
 SETTINGS = {"domain_rand.randomize_parameters": True, "domain_rand.push_robots": True, "noise.add_noise": True}
 SETTINGS |= {"domain_rand.push_probability": 0.2, "domain_rand.resampling_probability": 0.2}
-HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6]}
+HISTORY = {"env.history_length": 3, "motors.delay.range": [1, 6], "sensing.delay.range": [0, 6]}
 
 
 @pytest.fixture

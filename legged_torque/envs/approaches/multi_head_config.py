@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg
+from legged_torque.envs.base.clocks import whole_steps
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO, LinearChange
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Count, Sizes
@@ -59,12 +60,13 @@ class MultiHeadTwoRatesCfg(MultiHeadCfg):
         resampling_probability = 0.0005
         push_probability = 0.0005
 
-    def perturbations(self) -> dict[str, dict]:
-        """Return those of 50 Hz, with as many pushes per second."""
-        named = super().perturbations()
-        for changes in named.values():
-            changes["domain_rand"]["push_probability"] /= STEPS
-        return named
+    def set_clocks(self, policy_hz: float | None, physics_hz: float | None) -> float:
+        """Set the rates; position actions are held for the same time."""
+        ratio = super().set_clocks(policy_hz, physics_hz)
+        self.control.position_interval = whole_steps(
+            "control.position_interval", self.control.position_interval * ratio
+        )
+        return ratio
 
 
 class MultiHeadCfgPPO(LeggedRobotCfgPPO):

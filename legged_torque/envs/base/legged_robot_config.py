@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
@@ -107,20 +108,16 @@ class LeggedRobotCfg(BaseConfig):
         chain: list[str] = ["delay", "ideal"]  # links in order: those of actions, then those of torques
 
         class delay(DelayCfg):  # time from the policy to the motors
-            range = [0, 0]  # in ``unit``, drawn at every reset
-            unit = "physics_steps"  # of range and jitter
-            jitter = 0  # in ``unit``, up to which the actions of each control step are later
-            loss = 0.0  # share of control steps whose actions are lost: those before are held
+            range, unit = [0, 0], "physics_steps"  # drawn at every reset; the unit of all times
+            jitter, loss = 0, 0.0  # of each control step: longest further time, and share that is lost
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
 
     class sensing:  # from the robot's own sensors, joint encoders and IMU, to the policy
         class delay(LatencyCfg):  # of the measurement of each physics step; the critic sees the present
-            range = [0, 0]  # in ``unit``, drawn at every reset
-            unit = "physics_steps"  # of range and jitter
-            jitter = 0  # in ``unit``, up to which each measurement is later
-            loss = 0.0  # share of measurements that are lost: those before are held
+            range, unit = [0, 0], "physics_steps"  # as of ``motors.delay``
+            jitter, loss = 0, 0.0  # of each measurement
 
     class sensors:  # sensors by name: a sensor is a section with a method ``build``
         pass
@@ -253,7 +250,8 @@ class LeggedRobotCfg(BaseConfig):
         """Return the named changes that ``--perturbation`` chooses from (paper, IV-A)."""
 
         def environment(on: bool, velocity: float = 0.0, probability: float = 0.0) -> dict:
-            """Return the changes of one environment; pushes in m/s and per control step."""
+            """Return the changes of one environment; pushes in m/s and per 0.02 s."""
+            probability *= self.sim.dt * self.control.decimation / 0.02
             speeds = {"init_dof_vel": 0.5 * self.asset.max_dof_vel, "init_lin_vel": 0.5, "init_ang_vel": 0.5}
             states = {name: [-speed, speed] if on else [0.0, 0.0] for name, speed in speeds.items()}
             pushes = {"push_robots": on, "push_velocity": [-velocity, velocity], "push_probability": probability}
@@ -299,6 +297,10 @@ class LeggedRobotCfg(BaseConfig):
             "default": {"domain_rand": default, "noise": {"noise_scales": errors}},
             "hard": {"domain_rand": default | harder, "noise": {"noise_scales": errors | hard["noise_scales"]}},
         }
+
+    def set_clocks(self, policy_hz: float | None, physics_hz: float | None) -> float:
+        """Set the rates of policy and physics, see :func:`~legged_torque.envs.base.clocks.set_clocks`."""
+        return set_clocks(self, policy_hz, physics_hz)
 
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of a run of commit d8439d6 in today's layout."""

@@ -218,7 +218,7 @@ class Observations:
     def _of_group(self, term: ObservationTerm) -> Tensor:
         """Return the scaled values of a term with a group of its own."""
         scale: Any = term.scale  # a number
-        values = _marked(term.value() * scale)
+        values = _marked((term.sensed or term.value)() * scale)
         if self._add_noise and term.noise and not term.privileged:
             values = values + term.noise * scale * (2.0 * torch.rand_like(values) - 1.0)
         return values.clamp(-self._clip, self._clip)

@@ -49,6 +49,13 @@ class TrainingCfg(BaseConfig):
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
         return {"parallel": {}}
 
+    def set_clock(self, ratio: float) -> None:
+        """Let discounts and evaluations be of the same time with ``ratio`` control steps in place of one."""
+        cfg: Any = self
+        for name in ("gamma", "lam"):
+            setattr(cfg.algorithm, name, getattr(cfg.algorithm, name) ** (1.0 / ratio))
+        cfg.evaluation.num_samples = max(round(cfg.evaluation.num_samples * ratio), 1)
+
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.
 
