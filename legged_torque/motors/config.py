@@ -6,7 +6,7 @@ import pkgutil
 from typing import Annotated, Any, Literal
 
 from legged_torque.utils.config import Section
-from legged_torque.utils.limits import Limits
+from legged_torque.utils.limits import Limits, NotNegative
 
 
 class MotorCfg(Section):
@@ -31,3 +31,13 @@ class IdealCfg(MotorCfg):
     """Settings of :class:`~legged_torque.motors.ideal.IdealMotor`: any torque within the limits, at once."""
 
     _motor_class = "legged_torque.motors.ideal:IdealMotor"
+
+
+class PerturbationCfg(MotorCfg):
+    """Settings of :class:`~legged_torque.motors.perturbation.TorquePerturbation`, which perturbs torques."""
+
+    _motor_class = "legged_torque.motors.perturbation:TorquePerturbation"
+    most: NotNegative = 2.0  # [N m]
+    offset: NotNegative = 1.0
+    of_pos: NotNegative = 1.0  # [1/rad]
+    of_vel: NotNegative = 0.1  # [s/rad]

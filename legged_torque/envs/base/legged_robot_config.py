@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
-from legged_torque.motors.config import DelayCfg, IdealCfg
+from legged_torque.motors.config import DelayCfg, IdealCfg, PerturbationCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import (
@@ -108,6 +108,12 @@ class LeggedRobotCfg(BaseConfig):
         class delay(DelayCfg):  # time from the policy to the motors
             range = [0, 0]  # in ``unit``, drawn at every reset
             unit = "physics_steps"  # or "control_steps"
+
+        class perturbation(PerturbationCfg):  # random torques that depend on the state, if the chain names it
+            most = 2.0  # [N m] largest torque; ours, as are
+            offset = 1.0  # the largest weights, either way: of a constant,
+            of_pos = 1.0  # [1/rad] of the joint position,
+            of_vel = 0.1  # [s/rad] and of the joint velocity
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass
