@@ -18,7 +18,14 @@ os.environ["MUJOCO_GL"] = "disable"
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import LeggedRobot, TorqueRobot
-from legged_torque.envs.approaches import multi_head_config, torque_config, torque_curriculum_config, torque_gravity
+from legged_torque.envs.approaches import (
+    decap_config,
+    multi_head_config,
+    torque_config,
+    torque_curriculum_config,
+    torque_gravity,
+    variable_stiffness_config,
+)
 from legged_torque.envs.base import commands_config, legged_robot_config
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
@@ -55,6 +62,8 @@ CONFIGS = (
     (multi_head_config, "MultiHeadCfgPPO"),
     (multi_head_config, "MultiHeadTwoRatesCfg"),
     (multi_head_config, "MultiHeadTwoRatesCfgPPO"),
+    (variable_stiffness_config, "VariableStiffnessCfg"),
+    (decap_config, "DecapCfg"),
 )
 """Config classes in the order of the page."""
 

@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque.envs import robots
+from legged_torque.envs.approaches import decap_config as decap
 from legged_torque.envs.approaches import multi_head_config as multi_head
 from legged_torque.envs.approaches import torque_config as torque
 from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
 from legged_torque.envs.approaches import torque_gravity
+from legged_torque.envs.approaches import variable_stiffness_config as stiffness
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.envs.grounds.rough import RoughCfg, RoughCfgPPO, RoughScanCfg
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
@@ -78,12 +80,26 @@ class A1GravityMultiHeadCfgPPO(torque_gravity.TorqueGravityCfgPPO, multi_head.Mu
     """Training from a policy whose torque head stands."""
 
 
+class A1VariableStiffnessCfg(stiffness.VariableStiffnessCfg, A1Cfg):
+    """A1 with positions and stiffness."""
+
+
+class A1VariableStiffnessCfgPPO(stiffness.VariableStiffnessCfgPPO, A1CfgPPO):
+    """Its training."""
+
+
+class A1DecapCfg(decap.DecapCfg, A1TorqueCfg):
+    """A1 with torques and a PD bias that decays."""
+
+
 _ROBOT = "legged_torque.envs.base.legged_robot:LeggedRobot"
 _TORQUE = "legged_torque.envs.approaches.torque:TorqueRobot"
 _CURRICULUM = "legged_torque.envs.approaches.torque_curriculum:TorqueCurriculumRobot"
 _MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
 _CURRICULUM_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:CurriculumMultiHeadRobot"
 _TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
+_STIFFNESS = "legged_torque.envs.approaches.variable_stiffness:VariableStiffnessRobot"
+_DECAP = "legged_torque.envs.approaches.decap:DecapRobot"
 
 A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
     ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
@@ -91,6 +107,8 @@ A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], 
     ("a1_torque_gravity_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
+    ("a1_variable_stiffness", _STIFFNESS, A1VariableStiffnessCfg, A1VariableStiffnessCfgPPO),
+    ("a1_decap", _DECAP, A1DecapCfg, A1TorqueCfgPPO),
 )
 """Tasks of the A1 on a plane that no other robot has, or in another way: name, class, settings and training."""
 
@@ -158,6 +176,8 @@ PURPOSES = {
     "torque_gravity_multihead": "pre-training + torque multi-head",
     "torque_curriculum_high": "curriculum with a higher pose",
     "multihead_two_rates": "positions 50 Hz, torques 200 Hz",
+    "variable_stiffness": "positions and stiffness",
+    "decap": "torques, PD bias decays",
 }
 """What the tasks of an approach are, for lists."""
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.utils.config import Section
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import Limits, Share
+from legged_torque.utils.limits import Limits, NotNegative, Share
 
 
 class MotorCfg(Section):
@@ -69,6 +69,16 @@ class IdealCfg(MotorCfg):
     def describe(self) -> dict[str, Any]:
         """Return the name of the model; ``policy.yaml`` has its limits anyway."""
         return {"model": "ideal"}
+
+
+class PerturbationCfg(MotorCfg):
+    """Settings of :class:`~legged_torque.motors.perturbation.TorquePerturbation`, which perturbs torques."""
+
+    _motor_class = "legged_torque.motors.perturbation:TorquePerturbation"
+    most: NotNegative = 2.0  # [N m]
+    offset: NotNegative = 1.0
+    of_pos: NotNegative = 1.0  # [1/rad]
+    of_vel: NotNegative = 0.1  # [s/rad]
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:

@@ -31,6 +31,42 @@ def test_torque_torques(make_task, name):
     np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), torque_scale * action, rtol=1e-5)
 
 
+@pytest.mark.parametrize("group", ["leg", "joint"])
+def test_variable_stiffness_torques(make_task, group):
+    """Kp is 20 and 5 per unit of action, the leg's mean or the joint's own, from 10 to 60; Kd is 0.2 sqrt(Kp)."""
+    task = make_task("a1_variable_stiffness", 3, **{"control.stiffness_of": group})
+    q, qd, action = random_state(task)
+    change = 4.0 * action[:, 12:]
+    action[:, 12:] = change
+    if group == "leg":
+        change = change.reshape(3, 4, 3).mean(axis=2).repeat(3, axis=1)
+    kp = np.clip(20.0 + 5.0 * change, 10.0, 60.0)
+    assert kp.min() == 10.0 and kp.max() > 25.0
+    expected = kp * (NOMINAL + 0.25 * action[:, :12] - q) - 0.2 * np.sqrt(kp) * qd
+    np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), expected, rtol=1e-4, atol=1e-4)
+    hips, others = list(range(0, 12, 3)), [i for i in range(12) if i % 3]
+    image = task.mirror("actions", torch.ones(1, 24))[0].numpy()
+    assert (image[hips] == -1.0).all() and (image[others] == 1.0).all() and (image[12:] == 1.0).all()
+
+
+def test_decaying_bias(make_task):
+    """To 8 N m per unit of action comes PD towards the reference, which 0.99 multiplies every 409,600 steps."""
+    task = make_task("a1_decap", 3)
+    q, qd, action = random_state(task)
+    reference = NOMINAL + 0.1 * np.arange(12)
+    task.reference.copy_(torch.tensor(reference))
+    for total_steps in (0, 40_960_000):
+        task.total_steps.fill_(total_steps)
+        task.update_curriculum()
+        bias = 0.99 ** (total_steps / 409_600)
+        assert float(task.curriculum_values()["bias"]) == pytest.approx(bias, rel=1e-5)
+        expected = 8.0 * action + bias * (20.0 * (reference - q) - 0.5 * qd)
+        torques = task._compute_torques(torch.tensor(action).float())
+        np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
+    imitated = np.exp(-10.0 * np.square(q - reference).sum(axis=1))
+    np.testing.assert_allclose(task._reward_imitation_angles(), imitated, rtol=1e-3, atol=1e-12)
+
+
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 50_000_000, 60_000_000])
 @pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
 def test_multi_head_torques(make_task, name, end, total_steps):

@@ -68,7 +68,7 @@ def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
     assert wanted <= numbers.keys()
     assert all(len(numbers[tag]) == 2 for tag in wanted)
     assert numbers["Loss/skipped_updates"] == [0.0, 0.0]
-    first, last = capsys.readouterr().out.splitlines()
+    *_, first, last = capsys.readouterr().out.splitlines()
     assert first.startswith("iteration 1 of 2, ") and last.startswith("iteration 2 of 2, ") and "; KL 0.0" in last
 
 

@@ -243,3 +243,26 @@ def test_mistakes():
     assert "unknown motors.chain 'curv'; did you mean 'curve'?" in error_of(make, 1, ("curv",))
     assert "has the link 'slew' twice" in error_of(make, 1, ("slew", "slew"))
     assert "links that act on actions first" in error_of(make, 1, ("curve", "delay"))
+
+
+@pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
+def test_torque_perturbation(make_task, in_torch):
+    """Each joint gets 2 tanh(offset + of_pos q + of_vel qd) [N m] more, by weights that an episode draws."""
+    settings = {"motors.chain": ["delay", "perturbation", "ideal"], "control.decimation": 1, **HIGH_UP}
+    task = make_task("a1_torque", 200, **settings)
+    link = task.motors.links["perturbation"]
+    weights = [weight.numpy() for weight in (link.offset, link.of_pos, link.of_vel)]
+    for weight, most in zip(weights, (1.0, 1.0, 0.1), strict=True):
+        assert 0.99 * most < weight.max() <= most and -most <= weight.min() < -0.99 * most
+        assert abs(np.corrcoef(weight[:, 0], weight[:, 1])[0, 1]) < 0.3
+    if in_torch:
+        torques_in_torch(task)
+    before = weights[0].copy()
+    for _ in range(2):
+        q, qd = task.dof_pos.numpy().copy(), task.dof_vel.numpy().copy()
+        task.step(torch.ones(200, 12))
+        expected = 8.0 + 2.0 * np.tanh(weights[0] + weights[1] * q + weights[2] * qd)
+        np.testing.assert_allclose(task.torques, expected, atol=1e-5)
+    assert np.array_equal(before, weights[0])
+    task.reset()
+    assert not np.isclose(before, weights[0]).any()

@@ -67,6 +67,7 @@ class ActionTerm:
     reads: Any = None  # instance of the Warp struct that the law reads
     weight: Tensor | None = None  # of its torques, a scalar on the device; None is 1
     interval: int = 1  # control steps for which its actions are held, from the start of an episode on
+    is_unsigned: bool = False  # whether actions keep their signs in a mirror image
 
     def torques(self, actions: Tensor, pos: Tensor, vel: Tensor) -> Tensor:
         """Return the torques of this term without its weight [N m].

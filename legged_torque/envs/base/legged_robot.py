@@ -390,7 +390,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """
         unknown = [name for name, mirroring in self.parameter_mirrors.items() if mirroring is None]
         problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
-        actions = [(term.name, self.symmetry.joints) for term in self.control_law.terms]
+        joints, terms = self.symmetry.joints, self.control_law.terms
+        actions = [(term.name, joints.unsigned() if joints and term.is_unsigned else joints) for term in terms]
         return Mirror(self.observations.mirrors() | {"actions": actions}, self.symmetry.problem or problem, self.device)
 
     def _use_attributes_of(self, owner: RobotState | ControlParameters) -> None:

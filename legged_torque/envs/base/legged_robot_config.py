@@ -11,7 +11,7 @@ from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
-from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg
+from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg, PerturbationCfg
 from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.utils.config import BaseConfig, Section, to_dict
 from legged_torque.utils.errors import UserError
@@ -110,6 +110,12 @@ class LeggedRobotCfg(BaseConfig):
         class delay(DelayCfg):  # time from the policy to the motors
             range, unit = [0, 0], "physics_steps"  # drawn at every reset; the unit of all times
             jitter, loss = 0, 0.0  # of each control step: longest further time, and share that is lost
+
+        class perturbation(PerturbationCfg):  # random torques that depend on the state, if the chain names it
+            most = 2.0  # [N m] largest torque; ours, as are
+            offset = 1.0  # the largest weights, either way: of a constant,
+            of_pos = 1.0  # [1/rad] of the joint position,
+            of_vel = 0.1  # [s/rad] and of the joint velocity
 
         class ideal(IdealCfg):  # any torque within the limits, at once
             pass

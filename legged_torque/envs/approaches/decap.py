@@ -1,0 +1,74 @@
+"""Decaying action priors: PD torques lead the first torques of a policy (Sood et al., arXiv 2310.05714).
+
+The authors' reference are joint angles that a position policy has walked with. No such record comes with this package:
+the reference is the nominal pose unless a subclass writes another.
+"""
+
+from __future__ import annotations
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged_torque.envs.approaches.decap_config import DecapCfg as DecapCfg
+from legged_torque.envs.base.actions import ActionTerm, of_joint
+from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.kernel import read
+
+
+@wp.struct
+class Decap:
+    """Inputs of :func:`decap_torque`."""
+
+    torque_scale: wp.array2d[float]
+    p_gains: wp.array2d[float]
+    d_gains: wp.array2d[float]
+    reference: wp.array2d[float]
+    bias: wp.array[float]
+
+
+@wp.func
+def decap_torque(decap: Decap, action: float, world: int, joint: int, pos: float, vel: float) -> float:
+    """tau = scale a + bias (Kp (q_reference - q) - Kd qd) [N m]."""
+    prior = decap.p_gains[world, joint] * (decap.reference[world, joint] - pos) - decap.d_gains[world, joint] * vel
+    return of_joint(decap.torque_scale, world, joint) * action + decap.bias[0] * prior
+
+
+class DecapRobot(LeggedRobot):
+    """Torque control with a bias that decays: gamma^(t / k).
+
+    Attributes:
+        reference: Joint angles of the bias and of the imitation, for subclasses to write in place, e.g. in
+            ``_post_physics_step_callback`` [rad]. Shape: (num_envs, num_dof).
+        bias: Weight of the bias. Shape: (1,).
+    """
+
+    cfg: DecapCfg
+
+    def _init_buffers(self) -> None:
+        """Allocate reference and weight."""
+        super()._init_buffers()
+        self.reference = self.control.default_dof_pos.repeat(self.num_envs, 1)
+        self.bias = torch.ones(1, device=self.device)
+        self.update_curriculum()
+
+    def action_terms(self) -> list[ActionTerm]:
+        """Return one torque per joint, to which the bias is added."""
+        control = self.control
+        arrays = {"torque_scale": control.torque_scale, "p_gains": control.p_gains, "d_gains": control.d_gains}
+        reads = read(Decap, **arrays, reference=self.reference, bias=self.bias)
+        return [ActionTerm("biased_torque", control.torque_scale, "N m", "joint torque", decap_torque, reads)]
+
+    def update_curriculum(self) -> None:
+        """Let the bias decay."""
+        decay = self.cfg.control.decap
+        self.bias.copy_(decay.gamma ** (self.total_steps / decay.k))
+
+    def curriculum_values(self) -> dict[str, Tensor]:
+        """Return the weight of the bias too."""
+        return super().curriculum_values() | {"bias": self.bias[0]}
+
+    def _reward_imitation_angles(self) -> Tensor:
+        """exp(-10 |q - q_reference|^2), joint angles [rad]. Shape: (num_envs,)."""
+        error = (self.dof_pos - self.reference).square().sum(dim=1)
+        return torch.exp(-self.cfg.rewards.imitation_temperature * error)

@@ -1,0 +1,22 @@
+"""Settings of decaying action priors, see :mod:`~legged_torque.envs.approaches.decap`."""
+
+from __future__ import annotations
+
+from legged_torque.envs.approaches.torque_config import TorqueCfg
+from legged_torque.utils.config import Section
+from legged_torque.utils.limits import Fraction, Positive
+
+
+class DecapCfg(TorqueCfg):
+    """Settings of torque control with a decaying bias; the authors' gains are 20 N m/rad and 0.5 N m s/rad."""
+
+    class control:
+        class decap(Section):
+            gamma: Fraction = 0.99  # factor on the bias every
+            k: Positive = 409_600.0  # total steps: the authors' 100 control steps, in 4096 worlds
+
+    class rewards:
+        imitation_temperature: Positive = 10.0  # of the term
+
+        class scales:
+            imitation_angles: float = 0.0  # joint angles near the reference; the authors' weight is 1.5
