@@ -112,21 +112,11 @@ class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
     choices: dict[str, list[str]] = {"ideal": ["delay", "ideal"]}  # chains by name, for ``--motors``
-
-    class drive(DriveCfg):  # gains that the drive itself closes
-        pass
-
-    class lag(LagCfg):  # torques rise in a while
-        pass
-
-    class friction(FrictionCfg):  # in addition to that of the robot's file
-        pass
-
-    class thermal(ThermalCfg):  # less torque after a long load
-        pass
-
-    class quantize(QuantizeCfg):  # steps of torques
-        pass
+    drive = DriveCfg  # gains that the drive itself closes
+    lag = LagCfg  # torques rise in a while
+    friction = FrictionCfg  # in addition to that of the robot's file
+    thermal = ThermalCfg  # less torque after a long load
+    quantize = QuantizeCfg  # steps of torques
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
