@@ -108,25 +108,25 @@ MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, T
 """Settings by the name of the model."""
 
 
+class NetworkCfg(MotorCfg):
+    """Settings of :class:`~legged_torque.motors.network.NetworkMotor`, a network in place of a formula."""
+
+    _motor_class = "legged_torque.motors.network:NetworkMotor"
+    file: str = ""  # TorchScript
+    stiffness: PositivePerJoint = 20.0  # [N m/rad] Kp of the control law, with which it was logged
+    damping: PerJoint = 0.5  # [N m s/rad] Kd
+
+
 class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
     choices: dict[str, list[str]] = {"ideal": ["delay", "ideal"]}  # chains by name, for ``--motors``
-
-    class drive(DriveCfg):  # gains that the drive itself closes
-        pass
-
-    class lag(LagCfg):  # torques rise in a while
-        pass
-
-    class friction(FrictionCfg):  # in addition to that of the robot's file
-        pass
-
-    class thermal(ThermalCfg):  # less torque after a long load
-        pass
-
-    class quantize(QuantizeCfg):  # steps of torques
-        pass
+    drive = DriveCfg  # gains that the drive itself closes
+    lag = LagCfg  # torques rise in a while
+    friction = FrictionCfg  # in addition to that of the robot's file
+    thermal = ThermalCfg  # less torque after a long load
+    quantize = QuantizeCfg  # steps of torques
+    network = NetworkCfg  # trained with logged data
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
