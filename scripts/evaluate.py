@@ -81,6 +81,7 @@ def main() -> None:
         result = {"task": run.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
         result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
         result |= {"ranges": args.ranges or kept, "command": args.command, "num_envs": env.num_envs}
+        result |= {name: rate for name in cli.CLOCKS if (rate := getattr(args, name))}
         result |= {"seed": args.seed, "device": device, "versions": package_versions()}
         write_json(args.json, without_machine(result | measured))
 

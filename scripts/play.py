@@ -153,6 +153,7 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
     options = Options("", args.device, num_envs=1, load_run=args.compare, log_root=args.log_root)
     options.perturbation, options.ranges, options.set = args.perturbation, args.ranges, args.set
+    options.policy_hz, options.physics_hz = args.policy_hz, args.physics_hz
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(
