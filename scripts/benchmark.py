@@ -61,6 +61,7 @@ def main() -> None:
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
     result |= {"ranges": args.ranges or "default", "motors": args.motors or "default", "set": without_machine(args.set)}
+    result |= {name: rate for name in cli.CLOCKS if (rate := getattr(args, name))}
     memory = MemoryMeter(device)
     of_gpu = "GPU memory of torch and Warp together, without the CUDA context"
     print(f"{args.task} on {device_name(device)}, medians of {args.rounds} rounds")

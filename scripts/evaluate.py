@@ -82,6 +82,7 @@ def main() -> None:
         result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
         result |= {"ranges": args.ranges or kept, "motors": args.motors or kept, "command": args.command}
         result |= {"num_envs": env.num_envs, "seed": args.seed, "device": device, "versions": package_versions()}
+        result |= {name: rate for name in cli.CLOCKS if (rate := getattr(args, name))}
         write_json(args.json, without_machine(result | measured))
 
 

@@ -154,6 +154,7 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     options = Options("", args.device, num_envs=1, load_run=args.compare, log_root=args.log_root)
     options.perturbation, options.ranges, options.set = args.perturbation, args.ranges, args.set
     options.motors = args.motors
+    options.policy_hz, options.physics_hz = args.policy_hz, args.physics_hz
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(

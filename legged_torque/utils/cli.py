@@ -28,7 +28,7 @@ from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
 COMMAND = "legged-torque"  # the console command that runs every script
-CLOCKS = ("policy_hz", "physics_hz")
+CLOCKS = ("policy_hz", "physics_hz")  # options in Hz
 SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file", *CLOCKS)  # of every task
 RUNS = ("load_run", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
 TRAINING = ("max_iterations", "resume", "preset", "run_name", "logger", "verbose")  # of trainings alone
