@@ -29,7 +29,7 @@ def test_no_number_may_be_anything(bad):
         for i, cfg in enumerate(get_cfgs(task=task)):
             for path, value in flatten(to_dict(cfg)).items():
                 wrong = with_bad_number(value, bad)
-                by_name = bad == {} and path in ("control.stiffness", "control.damping")  # which the task refuses
+                by_name = bad == {} and path.startswith(("control.", "motors."))  # joints, which the task refuses
                 others = path.startswith("init_state.default_joint_angles.") or (i, path) in checked
                 if wrong is None or by_name or others:
                     continue
