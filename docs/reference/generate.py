@@ -26,7 +26,7 @@ from legged_torque.envs.approaches import (
     torque_gravity,
     variable_stiffness_config,
 )
-from legged_torque.envs.base import commands_config, legged_robot_config
+from legged_torque.envs.base import commands_config, legged_robot_config, linear_change
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.state import RobotState
@@ -43,7 +43,7 @@ SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
 SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
 """Where the settings of some classes stand."""
 CONFIGS = (
-    (legged_robot_config, "LinearChange"),
+    (linear_change, "LinearChange"),
     (legged_robot_config, "LeggedRobotCfg"),
     (commands_config, "CommandsCfg"),
     *((model_config, f"{name}Cfg") for name in ("Motors", "Model", "Curve", *LINKS)),

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
+from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg, PerturbationCfg
 from legged_torque.motors.model_config import MotorsCfg
-from legged_torque.utils.config import BaseConfig, Section, to_dict
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.limits import (
     Count,
     Fraction,
@@ -32,21 +32,6 @@ from legged_torque.utils.limits import (
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
-
-
-class LinearChange(Section):
-    """A value that changes linearly with the total number of environment steps (paper, eq. 1)."""
-
-    start: float = 1.0  # value up to t_start
-    end: float = 1.0  # value from t_end on
-    t_start: Number = 0  # [total steps]
-    t_end: Number = 1  # [total steps]
-
-    def check(self, path: str = "") -> None:
-        """Refuse values that are not allowed, and a change backwards in time."""
-        super().check(path)
-        if self.t_start > self.t_end:
-            raise UserError(f"{path}.t_start must be at most its t_end, {self.t_end}, not {self.t_start}")
 
 
 class LeggedRobotCfg(BaseConfig):

@@ -1,0 +1,22 @@
+"""Settings of values that change while a policy learns."""
+
+from __future__ import annotations
+
+from legged_torque.utils.config import Section
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Number
+
+
+class LinearChange(Section):
+    """A value that changes linearly with the total number of environment steps (paper, eq. 1)."""
+
+    start: float = 1.0  # value up to t_start
+    end: float = 1.0  # value from t_end on
+    t_start: Number = 0  # [total steps]
+    t_end: Number = 1  # [total steps]
+
+    def check(self, path: str = "") -> None:
+        """Refuse values that are not allowed, and a change backwards in time."""
+        super().check(path)
+        if self.t_start > self.t_end:
+            raise UserError(f"{path}.t_start must be at most its t_end, {self.t_end}, not {self.t_start}")
