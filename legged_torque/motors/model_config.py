@@ -108,15 +108,6 @@ MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, T
 """Settings by the name of the model."""
 
 
-class NetworkCfg(MotorCfg):
-    """Settings of :class:`~legged_torque.motors.network.NetworkMotor`, a network in place of a formula."""
-
-    _motor_class = "legged_torque.motors.network:NetworkMotor"
-    file: str = ""  # TorchScript
-    stiffness: PositivePerJoint = 20.0  # [N m/rad] Kp of the control law, with which it was logged
-    damping: PerJoint = 0.5  # [N m s/rad] Kd
-
-
 class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
@@ -126,7 +117,6 @@ class MotorsCfg(Section):
     friction = FrictionCfg  # in addition to that of the robot's file
     thermal = ThermalCfg  # less torque after a long load
     quantize = QuantizeCfg  # steps of torques
-    network = NetworkCfg  # trained with logged data
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""

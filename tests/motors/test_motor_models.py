@@ -10,7 +10,7 @@ from support.settings import error_of
 from legged_torque.envs import task_registry
 from legged_torque.motors import models
 from legged_torque.motors.joints import Joints
-from legged_torque.motors.model_config import MODELS, NetworkCfg
+from legged_torque.motors.model_config import MODELS
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.sim.randomization import Randomization
 from legged_torque.utils.config import update_from_dict
@@ -211,37 +211,6 @@ def test_draws_and_resets():
     torch.testing.assert_close(torques[:, 0], expected[:, 0])
     link.reset(torch.arange(200) < 100)
     assert (link.values.power[:100] == 0.0).all() and (link.values.power[100:, 0] > 0.0).any()
-
-
-class Network(torch.nn.Module):
-    """An LSTM in legged_gym's form."""
-
-    def __init__(self, inputs):
-        super().__init__()
-        self.lstm, self.out = torch.nn.LSTM(inputs, 8, 2, batch_first=True), torch.nn.Linear(8, 1)
-
-    def forward(self, seen: torch.Tensor, state: tuple[torch.Tensor, torch.Tensor]):
-        hidden, after = self.lstm(seen, state)
-        return self.out(hidden[:, -1]), after
-
-
-def test_network(tmp_path):
-    """Torques are those of the network for the whole sequence of errors and speeds; others are refused."""
-    torch.manual_seed(0)
-    network, cfg = Network(2), NetworkCfg()
-    cfg.file, cfg.stiffness, cfg.damping = str(tmp_path / "net.pt"), 25.0, {"hip": 0.5, "h": 0.4, "calf": 0.0}
-    torch.jit.script(network).save(cfg.file)
-    link = cfg.build(joints())
-    wanted, pos, vel = (torch.tensor(values) for values in draw(STEPS, WORLDS, 3))
-    torques = [link.apply(*values, 0) for values in zip(wanted, pos, vel, strict=True)]
-    errors = (wanted + torch.tensor([0.5, 0.4, 0.0]) * vel) / 25.0
-    sequence = torch.stack([errors, vel], dim=3).permute(1, 2, 0, 3).reshape(-1, STEPS, 2)
-    expected = network.out(network.lstm(sequence)[0]).view(WORLDS, 3, STEPS).permute(2, 0, 1)
-    torch.testing.assert_close(torch.stack(torques), expected.detach(), atol=1e-6, rtol=1e-5)
-    torch.jit.script(Network(3)).save(cfg.file)
-    assert "motors.own.file" in error_of(cfg.build, joints()) and "not 3" in error_of(cfg.build, joints())
-    cfg.file = __file__
-    assert "is not a TorchScript file" in error_of(cfg.build, joints())
 
 
 @pytest.mark.parametrize(
