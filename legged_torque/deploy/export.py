@@ -117,8 +117,8 @@ def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
 
 def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
     """Return a line for each part of a task that only the task can compute, apart from observations."""
-    links = task.motors.links.items()
-    silent = [name for name, motor in links if type(motor).describe is Motor.describe]  # they may do anything
+    inherited = {name: link for name, link in task.motors.links.items() if type(link).describe is Motor.describe}
+    silent = [name for name, link in inherited.items() if not link.describe()]  # they may do anything
     return parts_without_function(description) + [f"the motor '{name}' has no describe()" for name in silent]
 
 

@@ -17,7 +17,7 @@ from legged_torque.learning.protocols import Evaluation
 from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.files import write_whole
+from legged_torque.utils.files import append_whole
 from legged_torque.utils.runs import tagged
 
 SEED = 10_000  # added to the seed of a training, once for its first evaluator, twice for the second, and so on
@@ -154,5 +154,5 @@ def make_evaluators(
 def append_row(file: Path, row: dict[str, float]) -> None:
     """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written."""
     cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in row.values()]
-    before = file.read_text(encoding="utf-8") if file.is_file() else ",".join(row) + "\n"
-    write_whole(file, before + ",".join(cells) + "\n")
+    lines = [cells] if file.is_file() and file.stat().st_size else [row, cells]
+    append_whole(file, "".join(",".join(line) + "\n" for line in lines))

@@ -40,7 +40,3 @@ class IdealMotor(Motor):
     def kernel_reads(self) -> Any:
         """Return the limits."""
         return read(TorqueLimits, limits=self.joints.torque_limits)
-
-    def describe(self) -> dict[str, Any]:
-        """Return the name of the model."""
-        return self.cfg.describe()

@@ -208,7 +208,3 @@ class ModelMotor(Motor):
             RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
             for name, draw in draws.items()
         ]
-
-    def describe(self) -> dict[str, Any]:
-        """Return model and constants."""
-        return self.cfg.describe()

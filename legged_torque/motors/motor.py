@@ -61,5 +61,5 @@ class Motor(Buffers):
         return []
 
     def describe(self) -> dict[str, Any]:
-        """Return the constants of this link for ``policy.yaml``, plain values; empty if it does nothing."""
-        return {}
+        """Return the constants of this link for ``policy.yaml``, plain values: those of its settings."""
+        return self.cfg.describe()

@@ -50,6 +50,19 @@ def write_whole(file: Path, content: bytes | str) -> None:
             part.unlink(missing_ok=True)
 
 
+def append_whole(file: Path, text: str) -> None:
+    """Append to a file; a UserError if it cannot be written, and then it has no part of the text."""
+    rest = text.encode()
+    with write_errors(file), file.open("ab", buffering=0) as stream:
+        size = stream.tell()
+        try:
+            while rest:
+                rest = rest[stream.write(rest) :]
+        except OSError:
+            stream.truncate(size)
+            raise
+
+
 def write_json(file: Path, value: Any) -> None:
     """Write a JSON file by :func:`write_whole`; numbers that are not finite, which JSON does not know, become null."""
 

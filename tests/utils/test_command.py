@@ -69,7 +69,7 @@ def test_list_of_tasks(tmp_path):
 
 
 def test_values_in_a_word_of_their_own(tmp_path):
-    """``--set KEY VALUE`` and a misspelt ``--taks=x`` are told what they should be."""
+    """``--set KEY VALUE`` and a misspelt ``--taks=x`` are refused with what they should be."""
     result = run_here("train.py", "--set", "rewards.scales.torques", "-1e-4", root=tmp_path)
     assert_told_in_one_line(result, "give --set rewards.scales.torques=-1e-4")
     assert_told_in_one_line(run_here("train.py", "--taks=a1_torque", root=tmp_path), "did you mean '--task'?")

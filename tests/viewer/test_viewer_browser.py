@@ -227,7 +227,7 @@ def test_steering(opened, session):
 
 
 def test_keys_and_hints(opened, session):
-    """Keys do what they do in MuJoCo's window; what a label is for is told where the pointer rests on it."""
+    """Keys do what they do in MuJoCo's window; a hint at the pointer says what a label is for."""
 
     def press(key, focus="document.activeElement.blur()"):
         opened.execute_script(focus, control(opened, "contacts"))

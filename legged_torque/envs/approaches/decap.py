@@ -69,6 +69,6 @@ class DecapRobot(LeggedRobot):
         return super().curriculum_values() | {"bias": self.bias[0]}
 
     def _reward_imitation_angles(self) -> Tensor:
-        """exp(-10 |q - q_reference|^2), joint angles [rad]. Shape: (num_envs,)."""
+        """exp(-imitation_temperature |q - q_reference|^2), joint angles [rad]. Shape: (num_envs,)."""
         error = (self.dof_pos - self.reference).square().sum(dim=1)
         return torch.exp(-self.cfg.rewards.imitation_temperature * error)

@@ -19,4 +19,4 @@ class DecapCfg(TorqueCfg):
         imitation_temperature: Positive = 10.0  # of the term
 
         class scales:
-            imitation_angles: float = 0.0  # joint angles near the reference; the authors' weight is 1.5
+            imitation_angles: float = 0.0  # joint angles near the reference; the authors try 0.75 to 15

@@ -8,7 +8,7 @@ import torch
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
-from legged_torque.motors.joints import by_joint
+from legged_torque.motors.config import by_joint
 
 
 class PowerMeter:
@@ -16,6 +16,7 @@ class PowerMeter:
 
     In a physics step a torque is constant, and MuJoCo turns the joint by its new velocity times the step: the work is
     torque times new velocity times the step. Braking counts as driving, since nothing says that a battery takes it.
+    Torques are those that joints get: what a ``friction`` link takes from the motors is not counted.
 
     Attributes:
         is_on: Whether steps are measured; trainings do without. See :meth:`BaseTask.measure_power`.

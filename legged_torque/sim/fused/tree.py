@@ -38,6 +38,8 @@ Place = tuple[float, float, float]
 """A position, or half sizes, in half sizes of a geom."""
 MIN_PARTS = 4
 """Parts of a box that is not small, at least: enough to lie on."""
+MOST_PARTS = 4
+"""Parts of a capsule, at most."""
 
 SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
 REFUSED = "sim.engine 'fused' cannot simulate this robot"
@@ -108,7 +110,7 @@ def _parts(kind: mujoco.mjtGeom, size: np.ndarray, of_trunk: bool) -> list[tuple
     small. Capsules of legs have none: these would take a fifth of a physics step.
     """
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE and of_trunk:
-        count = next((count for count in range(1, MIN_PARTS) if size[0] + size[1] / count <= NEAR), MIN_PARTS)
+        count = next((count for count in range(1, MOST_PARTS) if size[0] + size[1] / count <= NEAR), MOST_PARTS)
         return [((0.0, 0.0, (2 * i + 1) / count - 1.0), (0.0, 0.0, 1.0 / count)) for i in range(count)]
     if kind != mujoco.mjtGeom.mjGEOM_BOX:
         return []
