@@ -1,5 +1,6 @@
 """Fixtures of all tests: tasks on the CPU, small and seeded."""
 
+import contextlib
 import os
 
 os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test renders
@@ -9,6 +10,8 @@ import torch
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # before anything imports triton: kernels of the update run on the CPU
+with contextlib.suppress(ImportError):
+    import triton  # noqa: F401  # before a script in this process loads OSMesa: after that it crashes
 
 from support.last_run import Recorder
 
