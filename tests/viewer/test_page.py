@@ -180,16 +180,16 @@ def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch, aspect):
     page = Page(session, "title", "127.0.0.1", 8460)
 
     def are_in_sight():
-        """Whether both are between the picture's edges, as seen by a pinhole camera."""
+        """Whether both are drawn apart and between the picture's edges, as seen by a pinhole camera."""
         ahead = client.camera.look_at - client.camera.position
         sideways = np.cross(ahead, [0.0, 0.0, 1.0])
         axes = np.array([axis / np.linalg.norm(axis) for axis in (ahead, sideways, np.cross(sideways, ahead))])
         robots = page._scene._robots
         places = np.array([robots[name]._handles[0].batched_positions[0] for name in ("robot", "companion")])
-        assert np.linalg.norm(places[0] - places[1]) > 1.7
+        apart = np.linalg.norm(places[0] - places[1]) > 1.7
         depth, right, up = axes @ (places + page._scene._root.position - client.camera.position).T
         half = np.tan(0.5 * client.camera.fov) * depth
-        return (abs(right) + 0.33 < half * aspect).all() and (abs(up) + 0.33 < half).all()
+        return apart and (abs(right) + 0.33 < half * aspect).all() and (abs(up) + 0.33 < half).all()
 
     with visitor(page.server, (2.0, -1.5, 1.0), aspect):
         (client,) = page.server.get_clients().values()
