@@ -1,7 +1,5 @@
 """The metrics of evaluations in tables and figures: titles, units, and which direction is better."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from legged_torque.utils.metrics import UNITS

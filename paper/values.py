@@ -10,8 +10,6 @@ The paper names no units; those of :mod:`legged_torque.utils.metrics` are ours. 
 cost of transport has no unit. Collision forces fit newtons: a standing A1 presses on the ground with 122 N.
 """
 
-from __future__ import annotations
-
 ENVIRONMENTS = {
     "low": "Low perturbation",
     "high": "High perturbation",

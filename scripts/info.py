@@ -3,8 +3,6 @@
 Versions, processor, GPU and driver, where compiled kernels are kept, and which extras can be used.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import platform

@@ -7,8 +7,6 @@ Examples:
     python scripts/sim2sim.py exported --viewer --robots 1
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib.metadata

@@ -5,8 +5,6 @@ kinds are compared in which only feet are near the ground, which is a plane near
 each foot.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math

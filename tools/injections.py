@@ -3,8 +3,6 @@
 No other world may differ by a bit, and a reset must make the world as good as new. Exits with 1 otherwise.
 """
 
-from __future__ import annotations
-
 import sys
 
 from legged_torque.utils.devices import disable_renderer

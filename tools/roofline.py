@@ -12,8 +12,6 @@ The operations and bytes are counted that the mathematics asks for, not those of
 There is no count of the physics' operations: iterations of its solver and contacts differ from world to world.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Write the generated pages of docs/ from code, README and others: ``python docs/reference/generate.py``."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import inspect

@@ -1,7 +1,5 @@
 """Speed and memory of training."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

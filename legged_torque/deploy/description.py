@@ -1,7 +1,5 @@
 """Reading, checking and writing ``policy.yaml``, the description of how to run a policy on a robot."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import math

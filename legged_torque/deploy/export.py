@@ -1,7 +1,5 @@
 """Export of a checkpoint for a robot: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import os

@@ -6,8 +6,6 @@ to 60 degrees; where they sink deeper, the shortest way out is sideways. A train
 contacts follow the same law as training's, so on rough ground they are no independent evidence.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

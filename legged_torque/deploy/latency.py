@@ -1,7 +1,5 @@
 """Packets that come late to one robot, in numpy, as :mod:`legged_torque.sim.packets` has them for many."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

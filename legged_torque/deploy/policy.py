@@ -1,7 +1,5 @@
 """An exported policy in numpy: observations, actions and torques of one robot, without torch or a simulator."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field

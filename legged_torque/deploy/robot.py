@@ -1,7 +1,5 @@
 """The robot of an MJCF file in plain MuJoCo, compared with ``policy.yaml``."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An exported policy in plain MuJoCo, one robot after another."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections import deque

@@ -3,8 +3,6 @@
 Task classes are named, not imported, so that a command line is answered before torch is there.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 import sys

@@ -1,7 +1,5 @@
 """A step of a cell while it runs: a training or an evaluation, in a process that a launcher has started."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shlex

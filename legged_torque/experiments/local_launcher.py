@@ -1,7 +1,5 @@
 """Steps of an experiment as processes on this machine, several at a time on each device."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

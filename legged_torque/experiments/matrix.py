@@ -1,7 +1,5 @@
 """A matrix of trainings, tasks x environments x seeds: its description, and the progress of each of its cells."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

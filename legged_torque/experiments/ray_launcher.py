@@ -1,7 +1,5 @@
 """Steps of an experiment on the machines of a Ray cluster."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import socket
@@ -50,7 +48,7 @@ class RayLauncher:
         cores = int(resources.get("CPU", 0.0))
         return min(cores, int(resources.get("GPU", 0.0) * self._per_gpu)) if self._per_gpu else cores
 
-    def start(self, matrix: Matrix, cell: Cell, state: CellState, log: BinaryIO, lock: BinaryIO) -> RayProcess:
+    def start(self, matrix: Matrix, cell: Cell, state: CellState, log: BinaryIO, lock: BinaryIO) -> "RayProcess":
         """Ask Ray to start a step somewhere; the lock is held by this process alone."""
         words = step_words(matrix, replace(cell, folder=Path(cell.name)), state, self.device)
         share = 1.0 / self._per_gpu if self._per_gpu else 0.0

@@ -4,8 +4,6 @@ Machines need not share a file system. Plain files are sent, by their paths belo
 name of a script of this package with its arguments.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Runs a matrix of trainings on a launcher. Finished steps are skipped, interrupted ones resumed."""
 
-from __future__ import annotations
-
 import contextlib
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Device time of an experiment: a small file per cell, which outlives kills."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable

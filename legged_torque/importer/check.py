@@ -1,7 +1,5 @@
 """Whether an imported robot stands on its feet."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Legs of a robot: chains of joints from the trunk to the ground, their names, mirror images and feet."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass
 from itertools import takewhile

@@ -1,7 +1,5 @@
 """Writing the MJCF of an imported robot."""
 
-from __future__ import annotations
-
 import re
 
 import mujoco

@@ -1,7 +1,5 @@
 """The nominal pose of a robot, the height of its trunk, and gains that hold it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

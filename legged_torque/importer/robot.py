@@ -1,7 +1,5 @@
 """An imported robot: all that its MJCF and its settings need, and notes on what was changed."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from itertools import chain, count

@@ -1,7 +1,5 @@
 """Writing the settings class of an imported robot."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -18,8 +16,6 @@ LINE = 90  # most characters of a literal in one line
 TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
 
 # Source: {file}
-
-from __future__ import annotations
 
 {imports}
 

@@ -1,7 +1,5 @@
 """Plain geoms in place of all others: spheres, capsules and boxes, which are cheap and exact on any ground."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

@@ -1,7 +1,5 @@
 """Reading a published MJCF or URDF: its parts as MuJoCo understands them, and notes on what was changed."""
 
-from __future__ import annotations
-
 import re
 import warnings
 import xml.etree.ElementTree as ET

@@ -1,7 +1,5 @@
 """Files of tensors: written atomically, checked, and read without running code in them."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import pickle

@@ -1,7 +1,5 @@
 """The distribution of actions."""
 
-from __future__ import annotations
-
 import torch
 from rsl_rl.modules import distribution
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Evaluation of a policy while it learns, in worlds of their own."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import math

@@ -1,7 +1,5 @@
 """Resume on several machines: the first process has the run, the others get copies of its files."""
 
-from __future__ import annotations
-
 import atexit
 import shutil
 import tempfile

@@ -1,7 +1,5 @@
 """A guard that ends trainings which cannot learn."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from legged_torque.learning.protocols import Health

@@ -1,7 +1,5 @@
 """The multi-head actor of the paper (III-C.2, Figure 2)."""
 
-from __future__ import annotations
-
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP

@@ -1,7 +1,5 @@
 """The interfaces between the trainer, what learns, and the task in which it learns."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """States of the streams of random numbers, with which a resumed run goes on."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

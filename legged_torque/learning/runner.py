@@ -1,7 +1,5 @@
 """The runner that users and the registry know: the trainer, built as rsl_rl's runner is."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """The training loop, for any learner and task with the members of :mod:`~legged_torque.learning.protocols`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

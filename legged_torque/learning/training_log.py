@@ -1,7 +1,5 @@
 """The log of a training: rsl_rl's curves and printed block, and the display."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import math

@@ -4,8 +4,6 @@
 checkpoint, and those of earlier checkpoints are removed after it: a kill leaves a pair that fits at any time.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The chain of links from the policy's actions to the torques of the joints."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Settings of motors: one section of ``motors`` per link of the chain. They need no torch."""
 
-from __future__ import annotations
-
 import pkgutil
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal

@@ -1,7 +1,5 @@
 """Time that actions take from the policy to the motors."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from torch import Tensor

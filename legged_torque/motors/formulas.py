@@ -5,8 +5,6 @@ and ``dt`` [s], ``decimation``, ``nominal_pose`` [rad] and ``highest_torque`` [N
 (num_dof,) or (num_envs, num_dof).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

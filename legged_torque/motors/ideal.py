@@ -1,7 +1,5 @@
 """Motors that give any torque within their limits at once."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

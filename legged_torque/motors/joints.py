@@ -1,7 +1,5 @@
 """The joints that motors drive, and numbers by joint."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -1,7 +1,5 @@
 """Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 

@@ -1,7 +1,5 @@
 """Motor models in torch and as kernels; their formulas are in :mod:`legged_torque.motors.formulas`."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

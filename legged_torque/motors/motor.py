@@ -1,7 +1,5 @@
 """The interface of motor models."""
 
-from __future__ import annotations
-
 from typing import Any, ClassVar
 
 from torch import Tensor

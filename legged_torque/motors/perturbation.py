@@ -1,7 +1,5 @@
 """Torques that are wrong in a way that depends on the state: a perturbation in torque space, for trainings."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

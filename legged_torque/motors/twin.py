@@ -1,7 +1,5 @@
 """Motors in numpy, as ``policy.yaml`` describes them: for simulations without torch."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

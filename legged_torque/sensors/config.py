@@ -1,7 +1,5 @@
 """Settings of sensors: one section of ``sensors`` per sensor. They need no torch."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from legged_torque.utils.config import Section

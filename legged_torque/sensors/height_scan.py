@@ -1,7 +1,5 @@
 """The height scan: how high the ground is around the trunk."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the robot's own sensors, joint encoders and the trunk's IMU, have told the policy."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The interface of sensors."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

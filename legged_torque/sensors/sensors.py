@@ -1,7 +1,5 @@
 """The sensors of a task by name."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any

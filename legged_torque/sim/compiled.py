@@ -1,7 +1,5 @@
 """Functions of torch's operations as a few kernels of a GPU, by ``torch.compile``."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

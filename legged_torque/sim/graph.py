@@ -1,7 +1,5 @@
 """Replay of a function as one CUDA graph, with torch and Warp on the same stream."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Iterator

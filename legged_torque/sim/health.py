@@ -1,7 +1,5 @@
 """Detection of worlds with numbers that are not finite, and of the tensors that caused them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

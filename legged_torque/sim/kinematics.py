@@ -1,7 +1,5 @@
 """Positions and velocities of points on a robot's bodies in all worlds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import mujoco

@@ -1,7 +1,5 @@
 """The engine "mujoco_warp": MuJoCo Warp's own step, for any robot that it can simulate."""
 
-from __future__ import annotations
-
 import mujoco
 import mujoco_warp as mjw
 import warp as wp

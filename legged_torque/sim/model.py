@@ -1,7 +1,5 @@
 """The simulated model of a robot's MJCF file, and the sizes of MuJoCo Warp's buffers for it."""
 
-from __future__ import annotations
-
 import mujoco
 
 from legged_torque.utils.errors import unknown_name

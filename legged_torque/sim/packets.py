@@ -1,7 +1,5 @@
 """Packets of numbers on their way from a sender to a receiver, which are late, jitter and get lost."""
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Launch of a kernel over worlds on all cores of a CPU, of which Warp itself uses one."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from collections.abc import Sequence

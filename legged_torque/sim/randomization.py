@@ -1,7 +1,5 @@
 """Drawing parameters of worlds at random, on the device, by mask."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The physics engines by name."""
 
-from __future__ import annotations
-
 import mujoco
 
 from legged_torque.sim.engine import Engine, HeightMap, require

@@ -1,7 +1,5 @@
 """Requirements on a robot's MJCF that hold for every engine."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterator
 

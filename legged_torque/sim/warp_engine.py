@@ -1,7 +1,5 @@
 """Base of engines on MuJoCo Warp's arrays: state, resets, divergence, parameters per world."""
 
-from __future__ import annotations
-
 import functools
 import operator
 from collections.abc import Sequence

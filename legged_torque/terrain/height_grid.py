@@ -1,7 +1,5 @@
 """Heights on a grid, as hosts and MuJoCo need them."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

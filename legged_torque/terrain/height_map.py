@@ -5,8 +5,6 @@ viewers. A cell between four samples is two triangles, which meet in the diagona
 That is how MuJoCo divides the cells of an ``hfield``, for contacts and for rays, and how MuJoCo Warp does.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

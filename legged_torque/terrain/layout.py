@@ -1,7 +1,5 @@
 """The layout of tiles of rough ground, and their map."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from dataclasses import dataclass, field
@@ -37,7 +35,7 @@ class Layout:
     difficulties: list[float] = field(default_factory=list)
 
     @classmethod
-    def of(cls, settings: Any) -> Layout:
+    def of(cls, settings: Any) -> "Layout":
         """Return the layout that the section ``terrain`` of a task's settings asks for."""
         values = to_dict(settings)
         return cls(**{field.name: values[field.name] for field in dataclasses.fields(cls)})

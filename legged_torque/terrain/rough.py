@@ -1,7 +1,5 @@
 """Rough ground in tiles, and the levels on which worlds train."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -51,7 +49,7 @@ class RoughGround(Terrain):
         self.levels = worlds % (settings.max_init_terrain_level + 1 if self._curriculum else layout.num_rows)
 
     @classmethod
-    def build(cls, settings: Any, num_envs: int, device: str) -> RoughGround:
+    def build(cls, settings: Any, num_envs: int, device: str) -> "RoughGround":
         """Make the ground of a section ``terrain``; errors of the constructor."""
         return cls(settings, num_envs, device)
 

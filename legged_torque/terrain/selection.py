@@ -1,7 +1,5 @@
 """Kinds and levels of rough ground for watching and measuring a policy."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The interface of grounds, and the plane. All points are in the world frame [m]; nothing here waits for the host."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco
@@ -18,7 +16,7 @@ class Terrain:
     """Its surface, unless it is a plane."""
 
     @classmethod
-    def build(cls, settings: Any, num_envs: int, device: str) -> Terrain:
+    def build(cls, settings: Any, num_envs: int, device: str) -> "Terrain":
         """Return the ground for a section ``terrain`` of settings, which :class:`Plane` does not need."""
         return cls()
 

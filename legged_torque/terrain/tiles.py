@@ -9,8 +9,6 @@ A kind of one's own is a function with these arguments in :data:`TILES`, and its
 ``terrain.terrain_proportions``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """State of objects that hold tensors of all worlds: what a resumed training needs to go on with the same bits."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

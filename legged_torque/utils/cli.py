@@ -1,7 +1,5 @@
 """The command line of the scripts: options with legged_gym's names, and errors as one line. Needs no torch."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import dataclasses

@@ -1,7 +1,5 @@
 """The console command ``legged-torque``: every script by its name, from any folder."""
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import os

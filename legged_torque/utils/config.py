@@ -1,7 +1,5 @@
 """Configuration classes in legged_gym's style; dictionaries and dotted paths to read and change them."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import inspect
@@ -111,7 +109,7 @@ class BaseConfig(Section):
     """A whole configuration."""
 
     @classmethod
-    def refuse_mistakes(cls, *others: type[BaseConfig]) -> None:
+    def refuse_mistakes(cls, *others: "type[BaseConfig]") -> None:
         """Raise a UserError that names all mistakes in names of settings, also those of other configurations.
 
         legged_gym's names have their successors, others the nearest names.

@@ -1,7 +1,5 @@
 """The device of a process, its renderer, and the cores of the machine. MuJoCo must not be imported here."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes.util
 import os

@@ -1,7 +1,5 @@
 """Files that are complete or absent, errors that name the file, and paths that name no folder of one machine."""
 
-from __future__ import annotations
-
 import contextlib
 import fcntl
 import json

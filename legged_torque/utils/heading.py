@@ -1,7 +1,5 @@
 """The heading of a body, for numpy arrays and torch tensors. Imports neither."""
 
-from __future__ import annotations
-
 from typing import Any, TypeAlias
 
 Array: TypeAlias = Any  # a numpy array or a torch tensor

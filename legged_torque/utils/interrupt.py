@@ -1,7 +1,5 @@
 """Stopping on Ctrl-C without losing work."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -27,7 +25,7 @@ class StopRequest:
         """Prepare; ``notify`` shows a line when the stop is requested, by default on standard error."""
         self._notify = notify or write_error
 
-    def __enter__(self) -> StopRequest:
+    def __enter__(self) -> "StopRequest":
         """Take over the signals; only a process's main thread can do so."""
         self._old = {}
         if threading.current_thread() is threading.main_thread():

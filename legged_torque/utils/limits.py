@@ -4,8 +4,6 @@ A plain type allows all its values, with numbers of ordinary size: ``float``, ``
 ``Annotated[float, Limits(...)]``, or one of the names below, allows fewer.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """Small batched math, in the conventions of MuJoCo: quaternions are (w, x, y, z) and turn body into world vectors."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

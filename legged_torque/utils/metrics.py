@@ -18,8 +18,6 @@ world was reset are left out, but for the count of falls.
 - falls_per_minute: resets that are not time-outs, per minute of one robot.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

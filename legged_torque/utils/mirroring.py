@@ -1,7 +1,5 @@
 """Mirror images as signed permutations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,12 +14,12 @@ class Mirroring:
     signs: tuple[float, ...]
 
     @classmethod
-    def of_signs(cls, *signs: float) -> Mirroring:
+    def of_signs(cls, *signs: float) -> "Mirroring":
         """Return the mirroring of entries that stay where they are."""
         return cls(tuple(range(len(signs))), signs)
 
     @classmethod
-    def joined(cls, parts: Sequence[Mirroring]) -> Mirroring:
+    def joined(cls, parts: "Sequence[Mirroring]") -> "Mirroring":
         """Return the mirroring of several vectors behind each other."""
         order: list[int] = []
         for part in parts:
@@ -29,11 +27,11 @@ class Mirroring:
             order += [start + place for place in part.order]
         return cls(tuple(order), tuple(sign for part in parts for sign in part.signs))
 
-    def unsigned(self) -> Mirroring:
+    def unsigned(self) -> "Mirroring":
         """Return the same permutation of values that keep their signs, such as masses."""
         return Mirroring(self.order, (1.0,) * len(self.order))
 
-    def of_vectors(self, each: Mirroring) -> Mirroring:
+    def of_vectors(self, each: "Mirroring") -> "Mirroring":
         """Return the mirroring of one vector per entry, each of which is mirrored by ``each``."""
         size = len(each.order)
         order = [size * place + part for place in self.order for part in each.order]

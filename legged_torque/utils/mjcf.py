@@ -1,7 +1,5 @@
 """Robots in MJCF files: MuJoCo's complaints in one line, chains of bodies, motors by transmission, colliding parts."""
 
-from __future__ import annotations
-
 import contextlib
 import warnings
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """The options that scripts share, as plain values, and the changes that they make to settings."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """YAML of strangers: plain values of ordinary size, with words and numbers as YAML 1.2 reads them."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Commands for processes that this process starts."""
 
-from __future__ import annotations
-
 import signal
 import sys
 

@@ -1,7 +1,5 @@
 """Progress of kernel compilation, which takes about a minute on a machine's first run."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys
@@ -43,7 +41,7 @@ class CompileProgress(threading.Thread):
         self._seconds, self._next_line = 0.0, SHOW_AFTER  # of compilation
         self._is_closed = threading.Event()
 
-    def __enter__(self) -> CompileProgress:
+    def __enter__(self) -> "CompileProgress":
         """Start watching."""
         self.start()
         return self

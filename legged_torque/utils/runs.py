@@ -1,7 +1,5 @@
 """Run folders: ``logs/<experiment>/<date and time>[_<run name>]`` with checkpoints, events and ``config.yaml``."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import importlib.metadata

@@ -1,7 +1,5 @@
 """The criterion of a standing robot, and holding a robot's pose under PD control in plain MuJoCo."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias

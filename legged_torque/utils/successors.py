@@ -1,7 +1,5 @@
 """Replacements of names that people know from legged_gym and from earlier versions."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Literal

@@ -1,7 +1,5 @@
 """Access to the page: only from this machine and from the page itself, or with the token in the printed address."""
 
-from __future__ import annotations
-
 import functools
 import http
 import ipaddress

@@ -1,7 +1,5 @@
 """Steps in real time."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections import deque

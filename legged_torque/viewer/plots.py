@@ -1,7 +1,5 @@
 """The panel with plots: velocities, gait, joints and reward terms of the followed world."""
 
-from __future__ import annotations
-
 import html
 from collections.abc import Iterable, Sequence
 from itertools import cycle

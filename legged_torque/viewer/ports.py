@@ -1,7 +1,5 @@
 """Ports for pages. Needs no extra."""
 
-from __future__ import annotations
-
 import errno
 import socket
 

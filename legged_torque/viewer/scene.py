@@ -1,7 +1,5 @@
 """The 3D scene of the page."""
 
-from __future__ import annotations
-
 import cmath
 import math
 from collections.abc import Collection, Iterable, Sequence

@@ -1,7 +1,5 @@
 """A task with a trained policy that runs live and takes requests, without any window or page."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import math
@@ -46,7 +44,7 @@ def request(method: Callable[..., None]) -> Callable[..., None]:
     """Make a method of :class:`Session` a request: a call is queued, and :meth:`Session.tick` carries it out."""
 
     @functools.wraps(method)
-    def ask(self: Session, *args: Any) -> None:
+    def ask(self: "Session", *args: Any) -> None:
         self.requests.append(functools.partial(method, self, *args))
 
     return ask
@@ -60,7 +58,7 @@ class Session:
     as a whole.
     """
 
-    companion: Session | None = None  # another policy, which steps with this one under the followed world's command
+    companion: "Session | None" = None  # another policy, which steps with this one under the followed world's command
     snapshot: Snapshot | None = None  # the last step; None before the first
     sim_time = 0.0  # simulated time since the start [s]
     is_paused = False

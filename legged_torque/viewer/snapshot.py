@@ -1,7 +1,5 @@
 """A running task in the host's memory, read once after each control step."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import cast
 

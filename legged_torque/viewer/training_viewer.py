@@ -1,7 +1,5 @@
 """The page and the videos of a running training, made from its checkpoints by low-priority processes on the CPU."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """A page that shows and steers a session: ``play.py --viewer web``."""
 
-from __future__ import annotations
-
 import functools
 import html
 import json

@@ -6,8 +6,6 @@ for all problems and has no upper limits. The problems here are small and alike,
 of a fixed number of iterations does, on torch.linalg's batched Cholesky factorization.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Inertia, bias forces and Jacobians of many states of one robot, from MuJoCo Warp."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 

@@ -15,8 +15,6 @@ from state to state, and no matrix changes its size.
 Floating point type and device are those of the arguments; nothing waits for the host.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

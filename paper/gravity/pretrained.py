@@ -4,8 +4,6 @@ A file holds the policy's network and the settings that give its inputs and outp
 wherever these are the same, and refused where they differ.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

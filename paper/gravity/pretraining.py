@@ -3,8 +3,6 @@
 It works for every approach that gives the actions for torques (``TorqueRobot.actions_for``).
 """
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math

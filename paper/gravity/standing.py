@@ -1,7 +1,5 @@
 """Trials of standing up from random states."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The number of CPU threads of torch."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Standing trials of the whole-body controller and of a pre-trained policy."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The whole-body controller that stands: task, posture and reaction force control in one (eq. 3)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

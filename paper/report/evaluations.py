@@ -1,7 +1,5 @@
 """Evaluations during training, as tables with a row per evaluation, from every file that holds them."""
 
-from __future__ import annotations
-
 import csv
 import gzip
 import zlib

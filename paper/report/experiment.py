@@ -1,7 +1,5 @@
 """The results of an experiment: everything that its folder, or a folder with runs of train.py, holds."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The report on an experiment: tables, figures, Markdown, and one HTML page that refers to nothing outside of it."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import re

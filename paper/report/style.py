@@ -1,7 +1,5 @@
 """Names, colours, lines and hatches of tasks, the same in all tables and figures; readable in grey, too."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Means over seeds and tests of their differences, and the tables of a report: rows of texts, the header first."""
 
-from __future__ import annotations
-
 from itertools import combinations, product
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Trainings made by ``train.py`` without a plan: those in a folder, and the names of their settings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path

@@ -4,8 +4,6 @@ The authors' reference are joint angles that a position policy has walked with. 
 the reference is the nominal pose unless a subclass writes another.
 """
 
-from __future__ import annotations
-
 import torch
 import warp as wp
 from torch import Tensor

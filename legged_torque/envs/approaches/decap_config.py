@@ -1,7 +1,5 @@
 """Settings of decaying action priors, see :mod:`~legged_torque.envs.approaches.decap`."""
 
-from __future__ import annotations
-
 from legged_torque.envs.approaches.torque_config import TorqueCfg
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Fraction, Positive

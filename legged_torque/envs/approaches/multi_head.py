@@ -1,7 +1,5 @@
 """Multi-head control: position and torque actions, mixed with weights that change in training (paper, III-C, IV-E)."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

@@ -1,7 +1,5 @@
 """Settings of multi-head control, see :mod:`~legged_torque.envs.approaches.multi_head`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg

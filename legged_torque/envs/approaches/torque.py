@@ -1,7 +1,5 @@
 """Default torque control: the policy's actions are joint torques (paper, section III and Figure 1)."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from legged_torque.envs.approaches.torque_config import TorqueCfg as TorqueCfg

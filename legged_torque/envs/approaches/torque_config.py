@@ -1,7 +1,5 @@
 """Settings of torque control, see :mod:`~legged_torque.envs.approaches.torque`."""
 
-from __future__ import annotations
-
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
 

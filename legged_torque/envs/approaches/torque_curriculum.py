@@ -1,7 +1,5 @@
 """Curriculum pre-training: at first the reward is to stand in the nominal pose (paper, III-B and IV-D)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Settings of curriculum pre-training, see :mod:`~legged_torque.envs.approaches.torque_curriculum`."""
 
-from __future__ import annotations
-
 from legged_torque.envs.approaches.torque_config import TorqueCfg, TorqueCfgPPO
 from legged_torque.envs.base.legged_robot_config import LinearChange
 from legged_torque.utils.limits import Positive

@@ -1,7 +1,5 @@
 """Gravity pre-training: the torque policy starts from one that has learned to stand by supervision (paper, III-A)."""
 
-from __future__ import annotations
-
 from legged_torque.envs.approaches.torque_config import TorqueCfgPPO
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Count, Fraction, NotNegative, Number, Positive, Share

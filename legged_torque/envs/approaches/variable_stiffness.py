@@ -1,7 +1,5 @@
 """Variable stiffness: the policy sends PD targets and how stiff to hold them (Spoljaric et al., arXiv 2502.09436)."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

@@ -1,7 +1,5 @@
 """Settings of variable stiffness, see :mod:`~legged_torque.envs.approaches.variable_stiffness`."""
 
-from __future__ import annotations
-
 from typing import Annotated, Literal
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO

@@ -1,7 +1,5 @@
 """From actions to wanted torques: one term per block of actions, each with a control law of one joint."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A robot's model, its parts by name, and its numbers by joint, from its settings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

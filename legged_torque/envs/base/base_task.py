@@ -1,7 +1,5 @@
 """The interface of tasks to rsl_rl and to trainers: steps, observations, episodes, counters, checkpoints."""
 
-from __future__ import annotations
-
 import hashlib
 from abc import abstractmethod
 from collections.abc import Callable, Sequence

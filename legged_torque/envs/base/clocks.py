@@ -1,7 +1,5 @@
 """The clocks of a task, in Hz: how often its policy acts, and how often its physics and motors step."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from legged_torque.utils.errors import UserError

@@ -1,7 +1,5 @@
 """Commanded velocities."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

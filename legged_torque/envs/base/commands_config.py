@@ -1,7 +1,5 @@
 """Settings of commands. They need no torch."""
 
-from __future__ import annotations
-
 import pkgutil
 from collections.abc import Sequence
 from typing import Annotated, Any

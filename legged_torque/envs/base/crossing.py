@@ -4,8 +4,6 @@ A trial is one episode. A robot starts in the middle of its tile, heads along x 
 that direction. It crosses the tile if its trunk gets over the tile's edge before it falls and before the trial is over.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -53,7 +51,7 @@ class Grounds:
     command: tuple[float, float]
 
     @classmethod
-    def of(cls, kinds: Sequence[str], levels: Sequence[float], command: Sequence[float] | None = None) -> Grounds:
+    def of(cls, kinds: Sequence[str], levels: Sequence[float], command: Sequence[float] | None = None) -> "Grounds":
         """Return grounds as users name them; a UserError if a kind, a level or a command of three makes no sense."""
         chosen, rising = named_kinds(kinds), rising_levels(levels)
         v_x, v_y, yaw_rate = command or (SPEED, 0.0, 0.0)

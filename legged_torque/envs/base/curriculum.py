@@ -1,7 +1,5 @@
 """Curricula on the device: of values, by the number of steps (eq. 1), and of commands, by how they are followed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

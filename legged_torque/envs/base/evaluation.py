@@ -1,7 +1,5 @@
 """Worlds in which a policy is measured, with the settings for that."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

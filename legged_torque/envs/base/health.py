@@ -1,7 +1,5 @@
 """The tensors of a task that must be finite in every world."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """A robot held in its nominal pose in plain MuJoCo, before a training."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

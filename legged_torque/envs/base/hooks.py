@@ -1,7 +1,5 @@
 """Methods of task classes that are never called: legged_gym's hooks, misspelt hooks, terms without a setting."""
 
-from __future__ import annotations
-
 import difflib
 import inspect
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The batched task: a legged robot that follows velocity commands."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

@@ -3,8 +3,6 @@
 Values that belong to a robot are placeholders here, see :mod:`legged_torque.envs.robots`.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks

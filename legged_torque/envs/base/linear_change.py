@@ -1,7 +1,5 @@
 """Settings of values that change while a policy learns."""
 
-from __future__ import annotations
-
 from legged_torque.utils.config import Section
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Number

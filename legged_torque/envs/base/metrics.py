@@ -1,7 +1,5 @@
 """Metrics of a walking policy, in all and by command."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """Observations: one list of terms, from which groups, sizes, noise, history and mirror images follow."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence

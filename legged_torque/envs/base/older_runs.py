@@ -1,7 +1,5 @@
 """Settings of runs of commit d8439d6, in today's layout: random parameters had a setting per operation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 _RANGES = {

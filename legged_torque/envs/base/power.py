@@ -1,7 +1,5 @@
 """Power of the motors, as means over the physics steps of a control step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import torch

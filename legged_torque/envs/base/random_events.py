@@ -1,7 +1,5 @@
 """Random events in the worlds of a task: resets, new commands, new parameters, pushes."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from typing import Any

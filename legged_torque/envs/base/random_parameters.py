@@ -1,7 +1,5 @@
 """The numbers of the robot, the ground and the controller that are drawn at random (paper, App. I-B)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

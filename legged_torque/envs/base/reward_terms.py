@@ -1,7 +1,5 @@
 """The reward terms of all tasks: one value per world without its weight, shape (num_envs,)."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

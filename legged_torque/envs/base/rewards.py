@@ -1,7 +1,5 @@
 """The weighted sum of reward terms. The terms themselves are methods ``_reward_<term>`` of the task."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

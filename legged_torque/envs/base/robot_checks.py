@@ -1,7 +1,5 @@
 """Checks that a robot's file and the settings of a task fit together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 
 import mujoco

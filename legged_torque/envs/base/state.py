@@ -1,7 +1,5 @@
 """The state of all robots, as observations, rewards, terminations, commands, events and sensors read it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The left-right mirror image of what a policy sees and does, for rsl_rl's symmetry extension."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

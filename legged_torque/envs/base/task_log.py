@@ -1,7 +1,5 @@
 """Sums over many steps, kept on the device and read once per iteration."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

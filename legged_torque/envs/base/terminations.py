@@ -1,7 +1,5 @@
 """The ends of episodes: time-outs, and terms as rewards have them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Validate the settings of a task before anything is built."""
 
-from __future__ import annotations
-
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError, unknown_name

@@ -1,7 +1,5 @@
 """Rough ground: tiles of growing difficulty, on which robots walk away from where they start."""
 
-from __future__ import annotations
-
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
 

@@ -1,7 +1,5 @@
 """The Unitree A1: figures of its URDF and of the paper, the same for all approaches."""
 
-from __future__ import annotations
-
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 

@@ -1,7 +1,5 @@
 """The ANYbotics ANYmal C: figures of MuJoCo Menagerie and of ANYbotics' URDF, the same for all approaches."""
 
-from __future__ import annotations
-
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 
 

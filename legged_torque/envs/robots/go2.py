@@ -1,7 +1,5 @@
 """The Unitree Go2: figures of MuJoCo Menagerie and of Unitree's URDF, the same for all approaches."""
 
-from __future__ import annotations
-
 from legged_torque.envs.robots.go1 import Go1Cfg, Go1CfgPPO
 from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 

@@ -1,7 +1,5 @@
 """Proximal policy optimization, with torch's operations or, where they can do it, with Triton's kernels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

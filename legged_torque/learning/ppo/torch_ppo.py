@@ -1,7 +1,5 @@
 """rsl_rl's PPO with an update that runs on the device from end to end."""
 
-from __future__ import annotations
-
 from itertools import zip_longest
 from typing import Any
 
@@ -101,7 +99,7 @@ class TorchPPO(PPO):
         return alg
 
     @classmethod
-    def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> TorchPPO:
+    def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> "TorchPPO":
         """Return the algorithm for networks, storage and settings; subclasses may choose between several."""
         return cls(actor, critic, storage, **settings)
 

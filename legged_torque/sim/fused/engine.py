@@ -1,7 +1,5 @@
 """The engine "fused": one kernel per physics step, for legged robots."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The memory of actor and critic: parameters in one piece, room for what layers compute, and tables of tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from itertools import chain, zip_longest
 from typing import Any

@@ -4,8 +4,6 @@ A network is a list of :class:`Layer`. Where a layer reads the outputs of severa
 other. All widths are multiples of :data:`ALIGNMENT`, with zeros in between.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -29,7 +27,7 @@ class Block:
 
     width: int = 0
 
-    def columns(self, size: int, elu: bool = False) -> Columns:
+    def columns(self, size: int, elu: bool = False) -> "Columns":
         """Hand out the next columns."""
         columns = Columns(self, self.width, size, elu)
         self.width += aligned(size)

@@ -1,7 +1,5 @@
 """PPO that acts and learns with the kernels of this package."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import math
@@ -30,7 +28,7 @@ def shows_compilation(method: Callable) -> Callable:
     """Show in the progress line that the first call of a method compiles its kernels."""
 
     @functools.wraps(method)
-    def call(self: TritonPPO, *args: Any) -> Any:
+    def call(self: "TritonPPO", *args: Any) -> Any:
         with contextlib.nullcontext() if method.__name__ in self.compiled else torch_compiles():
             self.compiled.add(method.__name__)
             return method(self, *args)
