@@ -28,7 +28,7 @@ from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.limits import Number
-from legged_torque.utils.options import DEFAULT_PRESET, DEFAULT_TASK, Options
+from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 from legged_torque.utils.words import counted
@@ -37,10 +37,8 @@ from legged_torque.viewer.training_viewer import TrainingViewer
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
 
-LONG_ON_CPU = 5_000_000  # steps, which take an hour or more
-LONG_NOTE = (
-    "a whole training takes hours to days on a CPU; --max_iterations 100 is a short one, and Ctrl-C keeps the run"
-)
+LONG_ON_CPU = 50_000_000  # steps, which take an hour or more
+LONG_NOTE = "this training takes hours on a CPU; --preset laptop takes minutes, and Ctrl-C keeps the run"
 
 
 def main() -> None:
@@ -72,6 +70,7 @@ def main() -> None:
         env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
+        processes = run.config.get("processes", 1)
         if is_first:
             print(f"Resuming from {run.checkpoint}, after {counted(run.iterations, 'iteration')}.")
     elif options.load_run or options.checkpoint is not None:
@@ -79,7 +78,11 @@ def main() -> None:
     else:
         options.task = options.task or DEFAULT_TASK
         with cli.slow_imports():
-            env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+            env_cfg, train_cfg = new_settings(options)
+        processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
+    on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu"
+    if on_cores and processes > 1 and distributed.world_size() == 1:
+        distributed.start_others(processes)
     folder = experiment_dir(train_cfg, options.log_root)
     if is_first:  # the others write nothing
         cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)
@@ -89,6 +92,16 @@ def main() -> None:
     set_seed(train_cfg.seed)
     with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
         train(options, env_cfg, train_cfg, viewer)
+
+
+def new_settings(options: Options) -> tuple[Any, Any]:
+    """Return the settings of a task and its training; on a CPU, those of the preset for it unless another is given."""
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    is_open = options.preset is None and CPU_PRESET in train_cfg.presets()
+    if is_open and resolve_device(options.device) == "cpu":
+        options.preset = CPU_PRESET
+        return task_registry.get_cfgs(options.task, options)
+    return env_cfg, train_cfg
 
 
 def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer) -> None:
@@ -127,7 +140,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     if is_first:
         if env.device == "cpu":
             is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not options.max_iterations
-            print_notes([LONG_NOTE if is_long else "", busy_cores_note(torch.get_num_threads())])
+            threads = max(torch.get_num_threads(), distributed.world_size())
+            print_notes([LONG_NOTE if is_long else "", busy_cores_note(threads)])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False

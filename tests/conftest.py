@@ -4,6 +4,7 @@ import contextlib
 import os
 
 os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test renders
+os.environ["OMP_NUM_THREADS"] = "1"  # of scripts as well: a training in one process
 
 import pytest
 import torch

@@ -103,7 +103,8 @@ class Trainer:
         guard = TrainingGuard(self.env.health)
         self._log.start(first, last, self.verbose)
         self.save_checkpoint()  # the viewer shows it while the first iterations run
-        with self._log.display, StopRequest(self._log.display.notify) as stop:
+        notify = self._log.display.notify if distributed.rank() == 0 else lambda text: None
+        with self._log.display, StopRequest(notify) as stop:
             while self.current_learning_iteration < last and not guard.problem:
                 asked = stop.requested or self._log.broken_pipe is not None or distributed.has_lost_parent()
                 if distributed.any_process(asked, self.device):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 UNIT = "iteration"
 LINE_AFTER_EVALUATION = 2.0  # seconds between two plain lines if there is a new evaluation
+WALKING = 0.7  # tracking from which on a policy walks
 TREND = 10  # evaluations with whose mean the last one is compared
 CELLS = 12  # characters of the curve of the tracking
 ENTRY = 36  # width of a name and its value in the panel [characters]
@@ -53,6 +54,7 @@ class TrainingDisplay(Display):
         steps_per_iteration: int,
         is_quiet: bool = False,
         clock: Callable[[], float] = time.monotonic,
+        walks_after: int = 0,
     ) -> None:
         """Prepare to show iterations.
 
@@ -64,8 +66,10 @@ class TrainingDisplay(Display):
             steps_per_iteration: Of all worlds.
             is_quiet: Whether nothing is shown.
             clock: Returns the time [s].
+            walks_after: Steps of all worlds after which such trainings have walked before; 0 if that is not known.
         """
         super().__init__(UNIT, total, done, stays=True, clock=clock)
+        self._walks_after = walks_after
         self._title, self._folder, self._steps, self._is_quiet = title, folder, steps_per_iteration, is_quiet
         self._env_steps, self._numbers = 0, dict[str, float]()  # so far; of the last iteration
         self._terms = dict[str, float]()  # rewards of the episodes that ended last, per second
@@ -134,6 +138,9 @@ class TrainingDisplay(Display):
         entries = {"steps": f"{self._env_steps:,}"}
         if speed is not None:
             entries["steps/s"] = f"{speed * self._steps:,.0f}"
+            if self._walks_after and max(self._tracking, default=0.0) < WALKING:
+                seconds = (self._walks_after - self._env_steps) / (speed * self._steps)
+                entries["walks"] = f"in about {seconds / 60:.0f} min" if seconds > 0.0 else "later than others did"
         entries |= {name: form.format(numbers[key]) for key, (name, form) in _SHOWN.items() if key in numbers}
         if self._tracking:
             entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"

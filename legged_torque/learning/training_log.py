@@ -55,7 +55,8 @@ class TrainingLog:
         title = f"{self._cfg.get('task') or 'training'}: {num_worlds} worlds on {device_name(self._env.device)}"
         is_quiet = verbose or self._logger.writer is None
         folder, steps = str(self._logger.log_dir), self.steps_per_iteration
-        self.display = TrainingDisplay(title, folder, last, first, steps, is_quiet)
+        walks_after = self._cfg.get("walks_after", 0)
+        self.display = TrainingDisplay(title, folder, last, first, steps, is_quiet, walks_after=walks_after)
 
     def prepare(
         self, iteration: int, times: dict[str, float], numbers: dict[str, float], measured: dict[str, float]

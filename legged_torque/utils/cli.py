@@ -12,19 +12,22 @@ import signal
 import sys
 import tempfile
 import textwrap
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_torque import SCRIPTS_DIR
+from legged_torque.utils import distributed
 from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.devices import disable_renderer
-from legged_torque.utils.errors import TrainingError, UserError, is_out_of_memory, unknown_name
+from legged_torque.utils.errors import TrainingError, UserError, has_lost_process, is_out_of_memory, unknown_name
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import Rate, check_value, describe, types_of
 from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.task_registry import task_registry
 
+LAST_WORDS = 2.0  # seconds after which a further process reports an error that the first one has not reported
 COMMAND = "legged-torque"  # the console command that runs every script
 CLOCKS = ("policy_hz", "physics_hz")  # options in Hz
 SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file", *CLOCKS)  # of every task
@@ -261,12 +264,16 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         elif is_out_of_memory(error):
             reason = (str(error).strip() or "no reason is given").splitlines()[0]
             message = f"this does not fit in memory, lower --num_envs: {reason}"
+        elif has_lost_process(error):
+            message = "another process of this training has ended; --resume goes on from the last checkpoint"
         else:
             raise
         status, line = 2, f"error: {message}"
     finally:
         if "triton" in sys.modules:
             gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
+    if distributed.rank() > 0:
+        time.sleep(LAST_WORDS)  # in which the first process, which has started this one, may end it
     print(line, file=sys.stderr)
     sys.exit(status)
 

@@ -65,14 +65,14 @@ def busy_cores() -> float:
 
 
 def busy_cores_note(threads: int) -> str:
-    """Return a note on computing with so many threads while other processes use the cores; empty if enough are free."""
+    """Return a note on training in so many threads while other processes use the cores; empty if enough are free."""
     cores = os.cpu_count() or 1
     others = busy_cores() if threads > 1 else 0.0
     if others < MANY or threads <= cores - others:
         return ""
     return (
-        f"other processes use {others:.1f} of {cores} cores, and torch has {threads} threads, which wait for each "
-        "other: OMP_NUM_THREADS=1 is likely faster"
+        f"other processes use {others:.1f} of {cores} cores, and training has {threads} threads, which wait for each "
+        f"other: OMP_NUM_THREADS={max(int(cores - others), 1)} is likely faster"
     )
 
 

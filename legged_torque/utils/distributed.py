@@ -1,4 +1,4 @@
-"""Several processes that train one policy, each on a GPU of its own, started by torchrun.
+"""Several processes that train one policy: on a GPU each, started by torchrun, or on a core each, started here.
 
 Their number is known without torch, which scripts import after they have read their command lines.
 """
@@ -6,19 +6,24 @@ Their number is known without torch, which scripts import after they have read t
 from __future__ import annotations
 
 import os
+import socket
+import subprocess
+import sys
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.processes import ending_with_parent
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
-_PARENT = os.getppid()  # torchrun, if it has started this process
+MAX_PROCESSES = 8  # that this module starts: each holds half a gigabyte of memory
+_PARENT = os.getppid()  # torchrun or the first process, if it has started this one
 
 
 def world_size() -> int:
-    """Return how many processes train together: 1 unless torchrun has started more."""
+    """Return how many processes train together: 1 unless torchrun or :func:`start_others` has started more."""
     return _variable("WORLD_SIZE", 1)
 
 
@@ -38,8 +43,33 @@ def local_rank() -> int:
 
 
 def has_lost_parent() -> bool:
-    """Return whether torchrun has been killed: the processes that it has started live on."""
-    return world_size() > 1 and os.getppid() != _PARENT
+    """Return whether what has started this process has been killed, as torchrun may be: its processes live on."""
+    return rank() > 0 and os.getppid() != _PARENT
+
+
+def usable_cores() -> int:
+    """Return how many cores this process may use: those that the system gives it, at most OMP_NUM_THREADS."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return min(cores, int(limit)) if limit.isdecimal() and int(limit) > 0 else cores
+
+
+def start_others(num_processes: int) -> None:
+    """Let so many processes in all train together on the cores of this machine; this one becomes the first of them.
+
+    The others run this process's command line, each with one thread, and end with this process.
+    """
+    import torch
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+    sizes = dict.fromkeys(("WORLD_SIZE", "LOCAL_WORLD_SIZE"), str(num_processes))
+    os.environ.update({**address, **sizes, "RANK": "0", "LOCAL_RANK": "0", "OMP_NUM_THREADS": "1"})
+    torch.set_num_threads(1)
+    command = ending_with_parent([sys.executable, *sys.orig_argv[1:]])
+    for number in map(str, range(1, num_processes)):
+        subprocess.Popen(command, env={**os.environ, "RANK": number, "LOCAL_RANK": number})
 
 
 def _variable(name: str, lowest: int) -> int:
@@ -70,10 +100,27 @@ def average(tensors: list[Tensor]) -> None:
     import torch
 
     flat = torch.cat([tensor.flatten() for tensor in tensors])
-    torch.distributed.all_reduce(flat)
+    if flat.is_cuda:
+        torch.distributed.all_reduce(flat)
+    else:
+        _sum_on_cpu(flat)
     flat /= torch.distributed.get_world_size()
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
         tensor.copy_(mean.view_as(tensor))
+
+
+def _sum_on_cpu(values: Tensor) -> None:
+    """Replace a tensor by its sum over all processes; for two of them a fifth of the time of gloo's all_reduce."""
+    import torch
+
+    if rank() > 0:
+        torch.distributed.send(values, 0)
+    else:
+        other = torch.empty_like(values)
+        for number in range(1, torch.distributed.get_world_size()):
+            torch.distributed.recv(other, number)
+            values += other
+    torch.distributed.broadcast(values, 0)
 
 
 def any_process(condition: bool, device: str) -> bool:

@@ -66,6 +66,11 @@ def collect_errors(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
+def has_lost_process(error: Exception) -> bool:
+    """Return whether an error says that a process has ended with which this one exchanges tensors on a CPU."""
+    return isinstance(error, RuntimeError) and "gloo" in str(error)
+
+
 def is_out_of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or one that led to it, says that memory has run out."""
     while error is not None:

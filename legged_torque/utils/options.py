@@ -10,6 +10,7 @@ from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value,
 from legged_torque.utils.successors import successor
 
 DEFAULT_PRESET = "parallel"
+CPU_PRESET = "laptop"  # chosen where there is no GPU
 DEFAULT_TASK = "a1_torque_multihead"
 
 
@@ -36,7 +37,8 @@ class Options:
     )
     seed: Number | None = _option("random seed; default: that of the training settings")
     preset: str | None = _option(
-        "training settings: parallel (the default), thorough (three times as long) or paper (Table II)"
+        "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long) or "
+        "paper (Table II)"
     )
     perturbation: str | None = _option(
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
@@ -68,7 +70,7 @@ class Options:
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
     max_iterations: Count | None = _option(
-        "iterations in all, with those before a resume; default: 110e6 environment steps"
+        "iterations in all, with those before a resume; default: 110e6 environment steps, on a CPU 12e6"
     )
 
     def __post_init__(self) -> None:

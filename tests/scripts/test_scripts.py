@@ -45,7 +45,7 @@ def test_run_folder(root):
     models = {"model_0.pt", "model_1.pt", "model_2.pt"}  # the first so that the training can be watched at once
     assert files == models | {"worlds_2.pt", "events.out", "config.yaml", "evaluations.csv"}
     config = yaml.safe_load((run / "config.yaml").read_text())
-    expected = {"task": "a1_position", "preset": "parallel", "device": "cpu", "max_iterations": 2}
+    expected = {"task": "a1_position", "preset": "laptop", "device": "cpu", "max_iterations": 2}
     assert expected.items() <= config.items() and config["env"]["env"]["num_envs"] == 2
 
 
@@ -117,9 +117,9 @@ def test_train_stop_resume_play(tmp_path):
         "env.episode_length_s": 0.06,  # three steps: there are rewards of whole episodes to print
     }
     changes = [f"--set={key}={value}" for key, value in settings.items()]
-    process = start("train.py", *task, *changes, "--num_envs=2", root=tmp_path)
+    process = start("train.py", *task, *changes, "--preset=parallel", "--num_envs=2", root=tmp_path)
     lines = list(itertools.takewhile(lambda line: "iteration 1 of" not in line, process.stdout))
-    assert any(line.startswith("Note: ") and "--max_iterations" in line for line in lines)  # it would take for days
+    assert any(line.startswith("Note: ") and "--preset laptop" in line for line in lines)  # this one takes hours
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
     assert status == 130 and "Traceback" not in error and "Stopping" in output + error

@@ -75,6 +75,12 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
         hidden_dims = [512, 256]  # shared by both heads
         head_hidden_dims: Sizes = [128]  # of either head
 
+    def presets(self) -> dict[str, dict[str, Any]]:
+        """Return those of other approaches, with small heads where networks are small."""
+        named = super().presets()
+        named["laptop"]["actor"] |= {"head_hidden_dims": [64]}
+        return named
+
 
 class MultiHeadTwoRatesCfgPPO(MultiHeadCfgPPO):
     """Training of multi-head control with two rates: discounts per second and evaluated time are those at 50 Hz."""

@@ -317,6 +317,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
         capture: bool = True  # on a GPU, replay steps, rollouts and updates as CUDA graphs; False runs the same without
         num_steps_per_env: Annotated[int, Limits(1, 1e6)] = 24  # control steps of a rollout
         total_steps: Count = 110_000_000  # over all worlds of all processes; --max_iterations overrides it
+        walks_after: Number = 0  # steps after which others like it tracked 70%, for the display; 0: unknown
         save_interval: Count = 50  # iterations between checkpoints
         experiment_name: str = ""  # folder of the runs; empty: the name of the task
         run_name: str = ""  # added to the name of the run's folder
@@ -388,4 +389,9 @@ class LeggedRobotCfgPPO(TrainingCfg):
         fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
         fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
-        return {"parallel": {}, "thorough": {"runner": {"total_steps": 330_000_000}}, "paper": table_ii}
+        small = {"actor": {"hidden_dims": [128, 128]}, "critic": {"hidden_dims": [128, 128]}}
+        runner = {"num_steps_per_env": 48, "total_steps": 12_000_000}
+        evaluation = {"interval": 500_000, "num_samples": 16_000}
+        laptop = {**small, "runner": runner, "algorithm": {"num_mini_batches": 8}, "evaluation": evaluation}
+        long = {"runner": {"total_steps": 330_000_000}}
+        return {"parallel": {}, "laptop": laptop, "thorough": long, "paper": table_ii}
