@@ -88,8 +88,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     for name, hint in types_of(Options).items():
         if isinstance(getattr(options, name), (int, float)):
             check_value(f"--{name}", getattr(options, name), hint)
-    for section, values in _named("preset", options.preset or DEFAULT_PRESET, train_cfg.presets()).items():
-        update_from_dict(env_cfg if section in section_keys(env_cfg) else train_cfg, {section: values})
+    train_cfg.use_preset(options.preset or DEFAULT_PRESET, env_cfg)
     if run_config:
         for part, cfg in {"env": env_cfg, "train": train_cfg}.items():
             if not isinstance(run_config[part], dict):

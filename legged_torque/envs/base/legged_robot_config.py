@@ -9,6 +9,7 @@ from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
+from legged_torque.envs.base.presets import standard_presets
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
 from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg, PerturbationCfg
 from legged_torque.motors.model_config import MotorsCfg
@@ -383,15 +384,4 @@ class LeggedRobotCfgPPO(TrainingCfg):
 
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
-        rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
-        ppo = {"num_learning_epochs": 5, "num_mini_batches": 32, "clip_param": 0.1, "gamma": 0.99, "lam": 0.9}
-        ppo |= {"entropy_coef": 5e-4, "learning_rate": 1e-4, "max_grad_norm": 5.0}
-        fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
-        fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
-        table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
-        small = {"actor": {"hidden_dims": [128, 128]}, "critic": {"hidden_dims": [128, 128]}}
-        runner = {"num_steps_per_env": 48, "total_steps": 12_000_000}
-        evaluation = {"interval": 500_000, "num_samples": 16_000}
-        laptop = {**small, "runner": runner, "algorithm": {"num_mini_batches": 8}, "evaluation": evaluation}
-        long = {"runner": {"total_steps": 330_000_000}}
-        return {"parallel": {}, "laptop": laptop, "thorough": long, "paper": table_ii}
+        return standard_presets()

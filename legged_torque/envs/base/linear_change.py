@@ -1,6 +1,6 @@
 """Settings of values that change while a policy learns."""
 
-from legged_torque.utils.config import Section
+from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Number
 
@@ -18,3 +18,12 @@ class LinearChange(Section):
         super().check(path)
         if self.t_start > self.t_end:
             raise UserError(f"{path}.t_start must be at most its t_end, {self.t_end}, not {self.t_start}")
+
+
+def scale_changes(settings: Section, factor: float) -> None:
+    """Let all linear changes within settings begin and end after ``factor`` times their steps."""
+    for section in (getattr(settings, key) for key in section_keys(settings)):
+        if isinstance(section, LinearChange):
+            section.t_start, section.t_end = round(factor * section.t_start), round(factor * section.t_end)
+        elif isinstance(section, Section):
+            scale_changes(section, factor)

@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from legged_torque.utils.config import BaseConfig, flat, to_dict
+from legged_torque.envs.base.linear_change import scale_changes
+from legged_torque.utils.config import BaseConfig, flat, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 
 if TYPE_CHECKING:
@@ -46,8 +47,20 @@ class TrainingCfg(BaseConfig):
                 raise UserError(f"runner.{key} must be a name, not the path '{value}'")
 
     def presets(self) -> dict[str, dict[str, Any]]:
-        """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
+        """Return the named changes to the settings of task and training that ``--preset`` chooses from.
+
+        Besides sections with their new values, one may have "linear_changes": a factor on the steps of all of them.
+        """
         return {"parallel": {}}
+
+    def use_preset(self, name: str, env_cfg: BaseConfig) -> None:
+        """Apply one of the presets to these settings and those of the task; a UserError if there is none."""
+        if name not in self.presets():
+            raise unknown_name("preset", name, self.presets())
+        changes = dict(self.presets()[name])
+        scale_changes(env_cfg, changes.pop("linear_changes", 1.0))
+        for section, values in changes.items():
+            update_from_dict(env_cfg if section in section_keys(env_cfg) else self, {section: values})
 
     def set_clock(self, ratio: float) -> None:
         """Let discounts and evaluations be of the same time with ``ratio`` control steps in place of one."""

@@ -1,4 +1,4 @@
-"""A training on a CPU uses all cores: train.py starts a process for each further one."""
+"""The preset laptop: a training on a CPU, in a process per core, with shorter curricula."""
 
 import os
 import signal
@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS, WORLDS = 4, 2
@@ -47,3 +51,15 @@ def test_all_cores(tmp_path, end):
         last = max(run.glob("model_*.pt"), key=lambda file: int(file.stem.split("_")[1]))
         state = torch.load(last, weights_only=True)
         assert state["infos"]["total_timesteps"] == state["iter"] * 2 * WORLDS * STEPS > 0
+
+
+@pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])
+def test_curricula_are_shorter(steps):
+    """After a quarter of the steps, each value that changes linearly is what it is in a training on a GPU."""
+    values = {}
+    for preset, share in {"parallel": 1.0, "laptop": 0.25}.items():
+        env_cfg, _ = task_registry.get_cfgs("a1_torque_curriculum_multihead", Options(device="cpu", preset=preset))
+        rewards, mixing = env_cfg.rewards.curriculum, env_cfg.control.mixing
+        changes = [rewards.tracking_lin_vel, rewards.tracking_ang_vel, rewards.nominal_position, mixing.pd]
+        values[preset] = LinearCurriculum(changes, "cpu")(torch.tensor(steps * share))
+    torch.testing.assert_close(values["laptop"], values["parallel"])
