@@ -11,7 +11,7 @@ def standard_presets() -> dict[str, dict[str, Any]]:
 def laptop() -> dict[str, Any]:
     """Return settings with which a robot walks soon on a CPU: few worlds, small networks, a short training."""
     return {
-        "linear_changes": 0.25,
+        "linear_changes": 0.2,
         "actor": {"hidden_dims": [128, 128]},
         "critic": {"hidden_dims": [128, 128]},
         "runner": {"num_steps_per_env": 48, "total_steps": 12_000_000},
