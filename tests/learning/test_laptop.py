@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from support.clock import Clock
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.utils.options import Options
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -60,6 +62,21 @@ def test_curricula_are_shorter(steps):
     for preset, share in {"parallel": 1.0, "laptop": 0.2}.items():
         env_cfg, _ = task_registry.get_cfgs("a1_torque_curriculum_multihead", Options(device="cpu", preset=preset))
         rewards, mixing = env_cfg.rewards.curriculum, env_cfg.control.mixing
-        changes = [rewards.tracking_lin_vel, rewards.tracking_ang_vel, rewards.nominal_position, mixing.pd]
+        changes = [rewards.tracking_lin_vel, rewards.tracking_ang_vel, rewards.nominal_position, mixing.torque]
         values[preset] = LinearCurriculum(changes, "cpu")(torch.tensor(steps * share))
     torch.testing.assert_close(values["laptop"], values["parallel"])
+
+
+def test_when_it_walks(capsys):
+    """The time until it walks is that of the steps which are left at this speed, as long as it does not walk."""
+    clock, shown = Clock(), ["walks in about 3 min", "walks later than others did", "tracking 0.750"]
+    measured = {"Evaluation/falls_per_minute": 0.0}
+    with TrainingDisplay("title", "folder", 1000, 0, 1000, clock=clock, walks_after=250_000) as display:
+        for i in range(1, 301):
+            clock.sleep(1.0)  # 1000 steps per second
+            tracking = {"Evaluation/track_percentage": 0.75, **measured} if i == 300 else {}
+            display.add_iteration(i, 1000 * i, tracking)
+    lines = capsys.readouterr().out.splitlines()
+    for line, text in zip((lines[6], lines[26], lines[-1]), shown, strict=True):  # after 61, 261 and 300 s
+        assert text in line
+    assert "walks" not in lines[-1]
