@@ -15,7 +15,7 @@ def laptop() -> dict[str, Any]:
         "actor": {"hidden_dims": [128, 128]},
         "critic": {"hidden_dims": [128, 128]},
         "runner": {"num_steps_per_env": 48, "total_steps": 15_000_000},
-        "algorithm": {"num_mini_batches": 4, "num_learning_epochs": 4},
+        "algorithm": {"num_mini_batches": 8},
         "evaluation": {"interval": 500_000, "num_samples": 16_000},
     }
 
