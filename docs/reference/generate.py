@@ -36,7 +36,7 @@ from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-LINKS = ("Drive", "Lag", "Friction", "Thermal", "Quantize")
+LINKS = ("Drive", "Lag", "Friction", "Thermal", "Quantize", "Encoder")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
 SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
 """Where the settings of some classes stand."""

@@ -79,6 +79,12 @@ class PerturbationCfg(MotorCfg):
     of_vel: NotNegative = 0.1  # [s/rad]
 
 
+def check_encoders(where: str, names: Sequence[str]) -> None:
+    """Raise a UserError if there are several links that act on measurements."""
+    if len(names) > 1:
+        raise UserError(f"{where} must have one encoder at most, not {', '.join(names)}")
+
+
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:
     """Return a number for each joint: one for all, or by a part of their names, of which the first match counts.
 

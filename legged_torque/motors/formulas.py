@@ -91,6 +91,17 @@ def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any,
     return motor.resolution * xp.round(wanted / motor.resolution), {}
 
 
+def encoder(xp: Any, motor: Any, pos: Any, vel: Any) -> tuple[Any, Any]:
+    """Positions and velocities as multiples of ``position_resolution`` [rad] and ``velocity_resolution`` [rad/s].
+
+    Policy, control law and the links before this one have them, and those behind it the true ones. The defaults are of
+    the messages of Unitree's GO-M8010-6 (unitree_actuator_sdk): 2 pi / 32768 rad and 2 pi / 256 rad/s of a rotor whose
+    gear is 6.33.
+    """
+    position, velocity = motor.position_resolution, motor.velocity_resolution
+    return position * xp.round(pos / position), velocity * xp.round(vel / velocity)
+
+
 def _approach(xp: Any, motor: Any) -> Any:
     """Return the share of the way to a constant input that a first-order lag goes in a physics step."""
     return 1.0 - xp.exp(-motor.dt / xp.clip(motor.time_constant, SMALL, None))
@@ -100,9 +111,10 @@ def _approach(xp: Any, motor: Any) -> Any:
 class Formula:
     """A formula and what it keeps."""
 
-    function: Callable[..., tuple[Any, dict[str, Any]]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state
+    function: Callable[..., tuple[Any, Any]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state by name
     state: tuple[str, ...] = ()  # names of arrays, 0 at the start of an episode
     begin: Callable[..., dict[str, Any]] | None = None  # (xp, motor) -> new state, before a control step
+    is_encoder: bool = False  # whether the function is (xp, motor, pos, vel) -> both as they are measured
 
 
 FORMULAS = {
@@ -113,5 +125,6 @@ FORMULAS = {
     "friction": Formula(friction),
     "thermal": Formula(thermal, ("mean_square",)),
     "quantize": Formula(quantize),
+    "encoder": Formula(encoder, is_encoder=True),
 }
 """The formulas by name, as ``policy.yaml`` has it under ``model``."""

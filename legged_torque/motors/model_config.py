@@ -102,7 +102,17 @@ class QuantizeCfg(ModelCfg):
     resolution: PositivePerJoint = 0.01  # [N m]
 
 
-MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg)}
+class EncoderCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.encoder`: steps of what joint encoders measure."""
+
+    _motor_class = "legged_torque.motors.models:EncoderModel"
+    _model = "encoder"
+    position_resolution: PositivePerJoint = 3.03e-5  # [rad]
+    velocity_resolution: PositivePerJoint = 3.88e-3  # [rad/s]
+
+
+_ALL = (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, EncoderCfg)
+MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 
 
@@ -115,6 +125,7 @@ class MotorsCfg(Section):
     friction = FrictionCfg  # in addition to that of the robot's file
     thermal = ThermalCfg  # less torque after a long load
     quantize = QuantizeCfg  # steps of torques
+    encoder = EncoderCfg  # steps of measurements, for policy, control law and the links before it
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""

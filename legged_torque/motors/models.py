@@ -140,6 +140,21 @@ def quantized_torque(m: Quantize, world: int, joint: int, substep: int, wanted: 
     return m.resolution[world, joint] * wp.rint(wanted / m.resolution[world, joint])
 
 
+@wp.struct
+class Encoder:
+    """Inputs of :func:`measured_state`, (num_envs, num_dof)."""
+
+    position_resolution: wp.array2d[float]
+    velocity_resolution: wp.array2d[float]
+
+
+@wp.func
+def measured_state(m: Encoder, world: int, joint: int, pos: float, vel: float) -> wp.vec2:
+    """Return position and velocity of :func:`~legged_torque.motors.formulas.encoder`."""
+    position, velocity = m.position_resolution[world, joint], m.velocity_resolution[world, joint]
+    return wp.vec2(position * wp.rint(pos / position), velocity * wp.rint(vel / velocity))
+
+
 KERNELS = {
     "curve": curve_torque,
     "drive": drive_torque,
@@ -147,6 +162,7 @@ KERNELS = {
     "friction": friction_torque,
     "thermal": derated_torque,
     "quantize": quantized_torque,
+    "encoder": measured_state,
 }
 """The Warp functions of formulas, by name."""
 
@@ -206,3 +222,13 @@ class ModelMotor(Motor):
             RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
             for name, draw in draws.items()
         ]
+
+
+class EncoderModel(ModelMotor):
+    """A link that changes what is measured of joints."""
+
+    acts_on = "measurements"
+
+    def measured(self, pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions [rad] and velocities [rad/s] as they are measured. Shapes: (num_envs, num_dof)."""
+        return self.formula.function(torch, self.values, pos, vel)

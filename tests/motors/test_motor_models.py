@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.settings import error_of
+from support.control import NOMINAL, pd_by_hand
+from support.episodes import HIGH_UP
+from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs import task_registry
 from legged_torque.motors import models
@@ -196,6 +198,34 @@ def test_energy_of_the_drive():
     assert start - data.energy[1] == pytest.approx(lost, rel=1e-6) and data.energy[1] < 0.1 * start
 
 
+@pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
+def test_encoder(make_task, in_torch):
+    """PD law, drive and policy have steps of position and speed; friction, behind the encoder, and critic true ones."""
+    steps = {"motors.encoder.position_resolution": 0.05, "motors.encoder.velocity_resolution": {"hip": 0.5, "joint": 2}}
+    chain = {"motors.chain": ["delay", "drive", "encoder", "friction"], "motors.drive.damping": 0.3}
+    settings = {"motors.friction.viscous_friction": 0.1, "control.decimation": 1, **HIGH_UP, **steps, **chain}
+    task = make_task("a1_position", 20, **settings)
+    if in_torch:
+        torques_in_torch(task)
+    twin = MotorTwin(described(task.motors.describe(), NOMINAL, task.dof_names))
+    step = np.array([0.5, 2.0, 2.0] * 4, np.float32)
+    for _ in range(3):
+        q, qd = task.dof_pos.numpy().copy(), task.dof_vel.numpy().copy()
+        seen, seen_qd = np.round(q / np.float32(0.05)) * np.float32(0.05), np.round(qd / step) * step
+        obs = task.get_observations()
+        np.testing.assert_allclose(obs["policy"][:, 9:21], seen - NOMINAL, atol=1e-6)
+        np.testing.assert_allclose(obs["policy"][:, 21:33], 0.05 * seen_qd, atol=1e-6)
+        np.testing.assert_allclose(obs["critic"][:, 21:33], 0.05 * qd, atol=1e-6)
+        actions = np.random.default_rng(0).normal(size=(20, 12))
+        task.step(torch.tensor(actions, dtype=torch.float32))
+        wanted = pd_by_hand(actions, seen, seen_qd)
+        expected = wanted - 0.3 * seen_qd - 0.1 * qd
+        np.testing.assert_allclose(task.torques, expected, rtol=1e-6, atol=2e-5)
+        np.testing.assert_allclose(twin.apply(wanted[0], q[0], qd[0]), expected[0], rtol=1e-6, atol=2e-5)
+        np.testing.assert_allclose(twin.measured(q[0], qd[0]), [seen[0], seen_qd[0]], rtol=1e-6)
+    assert "one encoder" in error_of(MotorTwin, described({"a": {"model": "encoder"}, "b": {"model": "encoder"}}))
+
+
 def test_draws_and_resets():
     """A constant is drawn as one number per world, of all joints; state goes with an episode."""
     cfg = settings("curve", **CONSTANTS["curve"], draws={"voltage": {"set": [0.8, 1.1]}})
@@ -244,6 +274,7 @@ def test_choices(task, choice, joint, speed, most):
         ("drive", {"damping": {"hip": 1.0}}, ["motors.own.damping", "thigh"]),
         ("lag", {"time_constnt": 0.1}, ["time_constant"]),
         ("friction", {"activation_speed": 0.0}, ["motors.own.activation_speed", "greater than 0"]),
+        ("encoder", {"velocity_resolution": {"h": 1.0, "calf": 0.0}}, ["motors.own.velocity_resolution", "greater"]),
         ("thermal", {"draws": {"continous_torque": {"scale": [0.9, 1.1]}}}, ["did you mean 'continuous_torque'"]),
     ],
 )

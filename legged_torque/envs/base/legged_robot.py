@@ -127,10 +127,11 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """Return the torques that motors are asked for [N m], at every physics step: those of :meth:`action_terms`.
 
-        Override it to compute them in torch; the physics kernel does not compute them then. Shapes: (num_envs,
-        num_actions) to (num_envs, num_dof).
+        Override it to compute them in torch; the physics kernel does not compute them then. Joint encoders tell
+        ``motors.measured``. Shapes: (num_envs, num_actions) to (num_envs, num_dof).
         """
-        return self.control_law.torques(actions, self.dof_pos, self.dof_vel, out=self._wanted_torques)
+        measured = self.motors.measured(self.dof_pos, self.dof_vel)
+        return self.control_law.torques(actions, *measured, out=self._wanted_torques)
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the terms of all groups of observations."""
@@ -345,7 +346,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
             self._torque_kernel = self.motors.kernel(law) if law else None
             if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
-        self.sensors = Sensors(cfg, self.state)
+        self.sensors = Sensors(cfg, self.state, self.motors)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
