@@ -17,15 +17,16 @@ ASSUMED_VOLTAGE: Draws = {"voltage": {"set": [0.85, 1.05]}}
 
 
 class ModelCfg(MotorCfg):
-    """Settings of a :class:`~legged_torque.motors.models.ModelMotor`; all but ``draws`` are constants by joint."""
+    """Settings of a :class:`~legged_torque.motors.models.ModelMotor`; its constants are by joint."""
 
     _motor_class = "legged_torque.motors.models:ModelMotor"
     _model = ""  # name of its formula, see ``motors.formulas``
+    _others: tuple[str, ...] = ("draws",)  # settings that are no constants of the formula
     draws: Draws = {}  # of constants by name, each one number per world: ranges as in ``domain_rand``
 
     def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
         """Return the numbers of all joints by constant; a UserError names what joints or ``draws`` do not have."""
-        names = [name for name in section_keys(self) if name != "draws"]
+        names = [name for name in section_keys(self) if name not in self._others]
         for name in self.draws:
             if name not in names:
                 raise unknown_name(f"{path}.draws", name, names)
@@ -33,21 +34,21 @@ class ModelCfg(MotorCfg):
 
     def describe(self) -> dict[str, Any]:
         """Return model and constants for ``policy.yaml``."""
-        settings = to_dict(self)
-        del settings["draws"]
+        settings = {name: value for name, value in to_dict(self).items() if name not in self._others}
         return {"model": self._model} | settings
 
 
 class CurveCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.curve`: how much torque at which speed; as they are, any."""
 
-    _model = "curve"
+    _model, _others = "curve", ("draws", "armature")
     knee_speed: PerJoint = 1e9  # [rad/s] X1, up to which a motor has its whole torque
     no_load_speed: PerJoint = 1e9  # [rad/s] X2, at which it has none
     driving_torque: PerJoint = 1e9  # [N m] Y1, most with the motion
     braking_torque: PerJoint = 1e9  # [N m] Y2, most against it
     voltage: PerJoint = 1.0  # of the bus, as a share of the nominal one
     sag: PerJoint = 0.0  # [1/kW] share of the voltage lost per mechanical power of all joints
+    armature: PerJoint | None = None  # [kg m^2] of the rotors through their gears; None: that of the robot's file
 
     def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
         """Return the numbers of all joints; a UserError if one has its knee beyond the no-load speed."""
@@ -132,6 +133,15 @@ class MotorsCfg(Section):
         if name not in self.choices:
             raise unknown_name("motors", name, self.choices)
         self.chain = list(self.choices[name])
+
+    def armature(self, dof_names: Sequence[str]) -> dict[str, float]:
+        """Return the armatures of motors in the chain by joint [kg m^2], of several the last; none: the file's."""
+        found: dict[str, float] = {}
+        for name in self.chain:
+            values = getattr(getattr(self, name, None), "armature", None)
+            if values is not None:
+                found = dict(zip(dof_names, by_joint(f"motors.{name}.armature", values, dof_names), strict=True))
+        return found
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""

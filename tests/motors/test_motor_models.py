@@ -10,6 +10,7 @@ from support.episodes import HIGH_UP
 from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.asset import load_asset
 from legged_torque.motors import models
 from legged_torque.motors.joints import Joints
 from legged_torque.motors.model_config import MODELS
@@ -266,11 +267,27 @@ def test_choices(task, choice, joint, speed, most):
     assert torques[list(pose).index(joint)] == pytest.approx(most, rel=1e-6, abs=1e-6)
 
 
+def test_armature():
+    """With its own motors, joints of the G1 have the inertia of their rotors more; of other robots, the file's."""
+    inertia = {}
+    for choice in ("ideal", "real"):
+        model = load_asset(task_registry.get_cfgs("g1_position", Options(device="cpu", motors=choice))[0]).mj_model
+        data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        inertia[choice] = np.diag(full)[6:] - (0.01 if choice == "ideal" else 0.0)
+    rotors = 2 * [0.01018, 0.0251, 0.01018, 0.0251, 2 * 0.00361, 2 * 0.00361]
+    np.testing.assert_allclose(inertia["real"] - inertia["ideal"], rotors, atol=1e-9)
+    cfg = task_registry.get_cfgs("go2_torque", Options(device="cpu", motors="real"))[0]
+    assert cfg.motors.armature(list(cfg.init_state.default_joint_angles)) == {}
+
+
 @pytest.mark.parametrize(
     ("model", "constants", "words"),
     [
         ("curve", {"knee_speed": 31.0, "no_load_speed": 30.0}, ["motors.own.knee_speed", "30", "31", "'hip'"]),
         ("curve", {"braking_torque": -1.0}, ["motors.own.braking_torque", "at least 0", "-1"]),
+        ("curve", {"armature": {"hip": -1.0}}, ["motors.own.armature", "-1"]),
         ("drive", {"damping": {"hip": 1.0}}, ["motors.own.damping", "thigh"]),
         ("lag", {"time_constnt": 0.1}, ["time_constant"]),
         ("friction", {"activation_speed": 0.0}, ["motors.own.activation_speed", "greater than 0"]),
