@@ -119,7 +119,7 @@ class Simulation:
                 actions = self._actions.received(self._now)
                 wanted = policy.wanted_torques(actions, *self._motors.measured(pos, vel))
             robot.step(self._motors.apply(wanted, pos, vel))
-            applied = robot.applied_torques()
+            applied = self._motors.before_friction(robot.applied_torques())
             self._power += np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
             self._now += 1
             if is_late:

@@ -82,6 +82,12 @@ class MotorChain:
                 torques = link.apply(torques, *state, substep)
         return torques
 
+    def before_friction(self, torques: Tensor) -> Tensor:
+        """Return what motors have made of torques that joints have got in a physics step [N m]; shapes as of them."""
+        for link in self.links.values():
+            torques = torques if link.lost is None else torques + link.lost
+        return torques
+
     def kernel(self, law: Part) -> Part | None:
         """Return the whole chain behind a control law as one Warp function; None if a link has none.
 

@@ -61,16 +61,18 @@ def lag(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict
 def friction(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
     """Static, Coulomb and viscous friction.
 
-    ``wanted - dry tanh(vel / activation_speed) - viscous vel`` with ``dry = coulomb + load |wanted| + (static -
-    coulomb) exp(-(vel / stribeck_speed)^2)``, in N m and N m s/rad. With static = coulomb it is that of unitree_rl_lab
-    (Fs, Fd, Va). Stribeck and load are of BAM (github.com/Rhoban/bam), whose load is the torque on the gears, the
-    motor's less the one from outside; only the motor's is known here. It is an explicit force: where static friction
-    over ``activation_speed``, times the physics step, exceeds a joint's inertia, the joint trembles around rest.
+    ``wanted - lost``, where ``lost = dry tanh(vel / activation_speed) + viscous vel`` and ``dry = coulomb + load
+    |wanted| + (static - coulomb) exp(-(vel / stribeck_speed)^2)``, in N m and N m s/rad. With static = coulomb it is
+    that of unitree_rl_lab (Fs, Fd, Va). Stribeck and load are of BAM (github.com/Rhoban/bam), whose load is the torque
+    on the gears, the motor's less the one from outside; only the motor's is known here. It is an explicit force: where
+    static friction over ``activation_speed``, times the physics step, exceeds a joint's inertia, the joint trembles
+    around rest.
     """
     stribeck = xp.exp(-((vel / motor.stribeck_speed) ** 2))
     dry = motor.coulomb_friction + motor.load_friction * xp.abs(wanted)
     dry = dry + (motor.static_friction - motor.coulomb_friction) * stribeck
-    return wanted - dry * xp.tanh(vel / motor.activation_speed) - motor.viscous_friction * vel, {}
+    lost = dry * xp.tanh(vel / motor.activation_speed) + motor.viscous_friction * vel
+    return wanted - lost, {"lost": lost}
 
 
 def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
@@ -122,7 +124,7 @@ FORMULAS = {
     "curve": Formula(curve, ("power", "dip"), sag),
     "drive": Formula(drive),
     "lag": Formula(lag, ("torque",)),
-    "friction": Formula(friction),
+    "friction": Formula(friction, ("lost",)),
     "thermal": Formula(thermal, ("mean_square",)),
     "quantize": Formula(quantize),
     "encoder": Formula(encoder, is_encoder=True),

@@ -92,6 +92,7 @@ class Friction:
     load_friction: wp.array2d[float]
     stribeck_speed: wp.array2d[float]
     activation_speed: wp.array2d[float]
+    lost: wp.array2d[float]
 
 
 @wp.func
@@ -100,7 +101,9 @@ def friction_torque(m: Friction, world: int, joint: int, substep: int, wanted: f
     relative, coulomb = vel / m.stribeck_speed[world, joint], m.coulomb_friction[world, joint]
     dry = coulomb + m.load_friction[world, joint] * wp.abs(wanted)
     dry += (m.static_friction[world, joint] - coulomb) * wp.exp(-relative * relative)
-    return wanted - dry * wp.tanh(vel / m.activation_speed[world, joint]) - m.viscous_friction[world, joint] * vel
+    lost = dry * wp.tanh(vel / m.activation_speed[world, joint]) + m.viscous_friction[world, joint] * vel
+    m.lost[world, joint] = lost
+    return wanted - lost
 
 
 @wp.struct
@@ -187,6 +190,7 @@ class ModelMotor(Motor):
             setattr(self.values, name, rows.clone() if name in cfg.draws else rows)
         for name in self.formula.state:
             setattr(self.values, name, self.buffer(name, len(joints.names)))
+        self.lost = self._buffers.get("lost")
 
     def send(self, actions: Tensor) -> None:
         """Begin a control step."""

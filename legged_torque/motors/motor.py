@@ -32,6 +32,9 @@ class Motor(Buffers):
     world, joint, pos, vel) -> wp.vec2`` of both.
     """
 
+    lost: Tensor | None = None
+    """What friction took from the torques in the last physics step [N m], for metrics. Shape: (num_envs, num_dof)."""
+
     def __init__(self, cfg: MotorCfg, joints: Joints) -> None:
         """Create the motors of all worlds."""
         super().__init__(joints.num_envs, joints.device)

@@ -67,6 +67,10 @@ class MotorTwin:
                 vars(motor).update(kept)
         return torques
 
+    def before_friction(self, torques: np.ndarray) -> np.ndarray:
+        """Return what motors have made of torques that joints have got in a physics step [N m]. Shape: (joints,)."""
+        return torques + sum(motor.lost for formula, motor in self._links if "lost" in formula.state)
+
     def measured(self, pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what control laws have of joint positions [rad] and velocities [rad/s]. Shapes: (joints,)."""
         for formula, motor in self._links:

@@ -180,23 +180,34 @@ def test_as_mujoco_s_dc_motor():
         assert twin.apply(np.full(3, 100.0), POSE, np.full(3, speed)) == pytest.approx(data.actuator_force[0], abs=1e-5)
 
 
-def test_energy_of_the_drive():
-    """What damping on the drive takes from a turning body is what the body loses, step by step, as MuJoCo counts it."""
-    model = mujoco.MjModel.from_xml_string(
+@pytest.mark.parametrize(
+    ("model", "constants", "made"),
+    [("drive", {"damping": 0.05}, 0.0), ("friction", {"viscous_friction": 0.03, "static_friction": 0.2}, 0.1)],
+)
+def test_energy_balance(model, constants, made):
+    """What the drive's damping and friction take from a turning body is what it loses, step by step, as MuJoCo counts.
+
+    A motor with friction is counted as making what was asked of it.
+    """
+    body = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0"><flag energy="enable"/></option><worldbody><body>'
         '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'
         '<actuator><motor joint="joint"/></actuator></mujoco>'
     )
-    data, twin, lost = mujoco.MjData(model), twin_of("drive", {"damping": 0.05}), 0.0
+    data, twin, lost, work = mujoco.MjData(body), twin_of(model, constants), 0.0, 0.0
     data.qvel = 12.0
-    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(body, data)
     start = data.energy[1]
     for _ in range(200):
-        data.ctrl, before = twin.apply(np.zeros(3), POSE, np.full(3, data.qvel[0]))[0], data.qvel[0]
-        mujoco.mj_step(model, data)
-        lost += 0.05 * before * (before + data.qvel[0]) / 2.0 * 0.002
-    mujoco.mj_forward(model, data)
-    assert start - data.energy[1] == pytest.approx(lost, rel=1e-6) and data.energy[1] < 0.1 * start
+        data.ctrl, before = twin.apply(np.full(3, made), POSE, np.full(3, data.qvel[0]))[0], data.qvel[0]
+        motor = twin.before_friction(data.ctrl)[0] if model == "friction" else 0.0
+        mujoco.mj_step(body, data)
+        moved = (before + data.qvel[0]) / 2.0 * 0.002
+        friction = 0.05 * before if model == "drive" else 0.2 * np.exp(-((before / 0.1) ** 2)) + 0.03 * before
+        lost, work = lost + friction * moved, work + motor * moved
+    mujoco.mj_forward(body, data)
+    assert start + work - data.energy[1] == pytest.approx(lost, rel=1e-6) and lost > 0.5 * start
+    assert work == pytest.approx(made * data.qpos[0], rel=0.01, abs=1e-9)
 
 
 @pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])

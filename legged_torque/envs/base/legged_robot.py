@@ -333,13 +333,13 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         cfg.env.num_actions = self.num_actions
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
         self._use_attributes_of(self.state)
-        self.power = PowerMeter(self.state, cfg.control, self.dof_names)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)
         constants = (self.dof_names, self.torque_limits, armature)
         self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, self.default_dof_pos))
         self.motor_strength = self.motors.strength
+        self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
         self._torque_kernel = None
         if "torques_in_kernel" in self.sim.capabilities and cfg.control.refresh_torques:
             law = self.control_law.kernel
