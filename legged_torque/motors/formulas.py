@@ -93,6 +93,20 @@ def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any,
     return motor.resolution * xp.round(wanted / motor.resolution), {}
 
 
+def muscle(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """A muscle that is activated and tires (SATA: Li et al., RSS 2025; marmotlab/SATA, go2_torque.py).
+
+    Its limit is ``growth`` times the robot's highest torque. The activation goes the share ``response`` of the way to
+    ``tanh(wanted / limit)`` in each physics step, and the torque is ``activation limit (1 - sign(activation) vel /
+    no_load_speed)``. The fatigue [N m s] becomes ``recovery (fatigue + |torque| dt)``.
+    """
+    limit = motor.growth * motor.highest_torque
+    activation = motor.activation + motor.response * (xp.tanh(wanted / limit) - motor.activation)
+    torque = activation * limit * (1.0 - xp.sign(activation) * vel / motor.no_load_speed)
+    fatigue = motor.recovery * (motor.fatigue + xp.abs(torque) * motor.dt)
+    return torque, {"activation": activation, "fatigue": fatigue}
+
+
 def encoder(xp: Any, motor: Any, pos: Any, vel: Any) -> tuple[Any, Any]:
     """Positions and velocities as multiples of ``position_resolution`` [rad] and ``velocity_resolution`` [rad/s].
 
@@ -127,6 +141,7 @@ FORMULAS = {
     "friction": Formula(friction, ("lost",)),
     "thermal": Formula(thermal, ("mean_square",)),
     "quantize": Formula(quantize),
+    "muscle": Formula(muscle, ("activation", "fatigue")),
     "encoder": Formula(encoder, is_encoder=True),
 }
 """The formulas by name, as ``policy.yaml`` has it under ``model``."""

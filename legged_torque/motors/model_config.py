@@ -103,6 +103,17 @@ class QuantizeCfg(ModelCfg):
     resolution: PositivePerJoint = 0.01  # [N m]
 
 
+class MuscleCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.muscle`, see :mod:`legged_torque.envs.approaches.sata`."""
+
+    _motor_class = "legged_torque.motors.models:MuscleModel"
+    _model = "muscle"
+    response: SharePerJoint = 0.6  # share of the way to a new activation, per physics step
+    no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque
+    recovery: SharePerJoint = 0.9  # factor on the fatigue, per physics step
+    growth: PositivePerJoint = 1.0  # share of the torque limits, which changes in training
+
+
 class EncoderCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.encoder`: steps of what joint encoders measure."""
 
@@ -112,7 +123,7 @@ class EncoderCfg(ModelCfg):
     velocity_resolution: PositivePerJoint = 3.88e-3  # [rad/s]
 
 
-_ALL = (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, EncoderCfg)
+_ALL = (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg)
 MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 

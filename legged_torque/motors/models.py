@@ -144,6 +144,31 @@ def quantized_torque(m: Quantize, world: int, joint: int, substep: int, wanted: 
 
 
 @wp.struct
+class Muscle:
+    """Inputs of :func:`muscle_torque`, (num_envs, num_dof) but for the highest torque (num_dof,)."""
+
+    response: wp.array2d[float]
+    no_load_speed: wp.array2d[float]
+    recovery: wp.array2d[float]
+    growth: wp.array2d[float]
+    activation: wp.array2d[float]
+    fatigue: wp.array2d[float]
+    highest_torque: wp.array[float]
+    dt: float
+
+
+@wp.func
+def muscle_torque(m: Muscle, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.muscle`."""
+    limit, before = m.growth[world, joint] * m.highest_torque[joint], m.activation[world, joint]
+    activation = before + m.response[world, joint] * (wp.tanh(wanted / limit) - before)
+    torque = activation * limit * (1.0 - wp.sign(activation) * vel / m.no_load_speed[world, joint])
+    m.activation[world, joint] = activation
+    m.fatigue[world, joint] = m.recovery[world, joint] * (m.fatigue[world, joint] + wp.abs(torque) * m.dt)
+    return torque
+
+
+@wp.struct
 class Encoder:
     """Inputs of :func:`measured_state`, (num_envs, num_dof)."""
 
@@ -165,6 +190,7 @@ KERNELS = {
     "friction": friction_torque,
     "thermal": derated_torque,
     "quantize": quantized_torque,
+    "muscle": muscle_torque,
     "encoder": measured_state,
 }
 """The Warp functions of formulas, by name."""
@@ -226,6 +252,20 @@ class ModelMotor(Motor):
             RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
             for name, draw in draws.items()
         ]
+
+
+class MuscleModel(ModelMotor):
+    """A link whose torque limits grow in training."""
+
+    def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
+        """Give the growth memory of its own. Errors as of ``cfg.constants``."""
+        super().__init__(cfg, joints)
+        self.values.growth = self.values.growth.clone()
+
+    def describe(self) -> dict[str, Any]:
+        """Return model and constants, and the growth of this moment of training."""
+        growth = self.values.growth[0].tolist()
+        return super().describe() | {"growth": dict(zip(self.joints.names, growth, strict=True))}
 
 
 class EncoderModel(ModelMotor):

@@ -31,6 +31,7 @@ CONSTANTS = {
     | {"load_friction": 0.05, "activation_speed": 0.5},
     "thermal": {"continuous_torque": {"hip": 5.0, "thigh": 12.0, "calf": 40.0}, "time_constant": 0.02},
     "quantize": {"resolution": {"hip": 0.5, "thigh": 0.01, "calf": 3.0}},
+    "muscle": {"growth": {"hip": 0.3, "thigh": 1.0, "calf": 0.7}},
 }
 
 
@@ -48,6 +49,10 @@ def by_hand(model, wanted, pos, vel):
     for step, (asked, speed) in enumerate(zip(wanted, vel, strict=True)):
         if model == "lag":
             state = torques[step] = asked + np.exp(-DT / np.array([1e-9, 0.002, 0.02])) * (state - asked)
+        elif model == "muscle":
+            limit = PEAK * np.array([0.3, 1.0, 0.7])
+            state = 0.4 * state + 0.6 * np.tanh(asked / limit)
+            torques[step] = limit * (state - np.abs(state) * speed / 21.0)
         elif model == "thermal":
             rated, decay = np.array([5.0, 12.0, 40.0]), np.exp(-DT / 0.02)
             most = [np.interp(np.sqrt(state[:, j]), [0.8 * r, r], [max(PEAK, r), r]) for j, r in enumerate(rated)]
@@ -100,6 +105,7 @@ def evaluate_all(
     friction: models.Friction,
     thermal: models.Thermal,
     quantize: models.Quantize,
+    muscle: models.Muscle,
     wanted: wp.array2d[float],
     pos: wp.array2d[float],
     vel: wp.array2d[float],
@@ -115,6 +121,7 @@ def evaluate_all(
     torques[3, i, j] = models.friction_torque(friction, i, j, 0, tau, q, qd)
     torques[4, i, j] = models.derated_torque(thermal, i, j, 0, tau, q, qd)
     torques[5, i, j] = models.quantized_torque(quantize, i, j, 0, tau, q, qd)
+    torques[6, i, j] = models.muscle_torque(muscle, i, j, 0, tau, q, qd)
 
 
 def draw(*shape):
@@ -134,7 +141,7 @@ def computed():
     in_torch, in_kernel = (
         {model: settings(model, **own).build(joints()) for model, own in CONSTANTS.items()} for _ in range(2)
     )
-    reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(6, WORLDS, 3)
+    reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(7, WORLDS, 3)
     twins = {model: [twin_of(model, own) for _ in range(WORLDS)] for model, own in CONSTANTS.items()}
     for step in range(STEPS):
         inputs = [torch.tensor(values[step]) for values in (wanted, pos, vel)]
