@@ -59,16 +59,6 @@ class DelayCfg(LatencyCfg, MotorCfg):
     _motor_class = "legged_torque.motors.delay:ActionDelay"
 
 
-class IdealCfg(MotorCfg):
-    """Settings of :class:`~legged_torque.motors.ideal.IdealMotor`: any torque within the limits, at once."""
-
-    _motor_class = "legged_torque.motors.ideal:IdealMotor"
-
-    def describe(self) -> dict[str, Any]:
-        """Return the name of the model; ``policy.yaml`` has its limits anyway."""
-        return {"model": "ideal"}
-
-
 class PerturbationCfg(MotorCfg):
     """Settings of :class:`~legged_torque.motors.perturbation.TorquePerturbation`, which perturbs torques."""
 

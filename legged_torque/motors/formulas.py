@@ -54,7 +54,7 @@ def drive(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, di
 
 def lag(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
     """First-order lag with ``time_constant`` [s], exact for torques that stay the same during a physics step."""
-    torque = motor.torque + _approach(xp, motor) * (wanted - motor.torque)
+    torque = motor.torque + _approach(xp, motor.dt, motor.time_constant) * (wanted - motor.torque)
     return torque, {"torque": torque}
 
 
@@ -85,7 +85,8 @@ def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, 
     share = xp.clip((continuous - rms) / xp.clip(continuous * (1.0 - motor.derating_from), SMALL, None), 0.0, 1.0)
     most = continuous + share * xp.clip(motor.highest_torque - continuous, 0.0, None)
     torque = xp.clip(wanted, -most, most)
-    return torque, {"mean_square": motor.mean_square + _approach(xp, motor) * (torque**2 - motor.mean_square)}
+    share = _approach(xp, motor.dt, motor.time_constant)
+    return torque, {"mean_square": motor.mean_square + share * (torque**2 - motor.mean_square)}
 
 
 def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
@@ -96,14 +97,16 @@ def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any,
 def muscle(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
     """A muscle that is activated and tires (SATA: Li et al., RSS 2025; marmotlab/SATA, go2_torque.py).
 
-    Its limit is ``growth`` times the robot's highest torque. The activation goes the share ``response`` of the way to
-    ``tanh(wanted / limit)`` in each physics step, and the torque is ``activation limit (1 - sign(activation) vel /
-    no_load_speed)``. The fatigue [N m s] becomes ``recovery (fatigue + |torque| dt)``.
+    Its limit is ``growth`` times the robot's highest torque. The activation follows ``tanh(wanted / limit)`` with
+    ``activation_time`` [s], and the torque is ``activation limit (1 - sign(activation) vel / no_load_speed)``. The
+    fatigue [N m s] is the sum of |torque| dt, of which each physics step leaves ``exp(-dt / recovery_time)``. The
+    authors' figures are 0.6 of the way and 0.9 left per step of 5 ms.
     """
     limit = motor.growth * motor.highest_torque
-    activation = motor.activation + motor.response * (xp.tanh(wanted / limit) - motor.activation)
+    share = _approach(xp, motor.dt, motor.activation_time)
+    activation = motor.activation + share * (xp.tanh(wanted / limit) - motor.activation)
     torque = activation * limit * (1.0 - xp.sign(activation) * vel / motor.no_load_speed)
-    fatigue = motor.recovery * (motor.fatigue + xp.abs(torque) * motor.dt)
+    fatigue = (1.0 - _approach(xp, motor.dt, motor.recovery_time)) * (motor.fatigue + xp.abs(torque) * motor.dt)
     return torque, {"activation": activation, "fatigue": fatigue}
 
 
@@ -118,9 +121,9 @@ def encoder(xp: Any, motor: Any, pos: Any, vel: Any) -> tuple[Any, Any]:
     return position * xp.round(pos / position), velocity * xp.round(vel / velocity)
 
 
-def _approach(xp: Any, motor: Any) -> Any:
-    """Return the share of the way to a constant input that a first-order lag goes in a physics step."""
-    return 1.0 - xp.exp(-motor.dt / xp.clip(motor.time_constant, SMALL, None))
+def _approach(xp: Any, dt: Any, time_constant: Any) -> Any:
+    """Return the share of the way to a constant input that a first-order lag goes in ``dt`` [s]."""
+    return 1.0 - xp.exp(-dt / xp.clip(time_constant, SMALL, None))
 
 
 @dataclass(frozen=True)

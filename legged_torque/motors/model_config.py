@@ -1,5 +1,6 @@
 """Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -36,6 +37,12 @@ class ModelCfg(MotorCfg):
         """Return model and constants for ``policy.yaml``."""
         settings = {name: value for name, value in to_dict(self).items() if name not in self._others}
         return {"model": self._model} | settings
+
+
+class IdealCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.ideal`: any torque within the limits, at once."""
+
+    _model = "ideal"
 
 
 class CurveCfg(ModelCfg):
@@ -108,9 +115,9 @@ class MuscleCfg(ModelCfg):
 
     _motor_class = "legged_torque.motors.models:MuscleModel"
     _model = "muscle"
-    response: SharePerJoint = 0.6  # share of the way to a new activation, per physics step
-    no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque
-    recovery: SharePerJoint = 0.9  # factor on the fatigue, per physics step
+    activation_time: PositivePerJoint = -0.005 / math.log(0.4)  # [s] time constant of the activation
+    recovery_time: PositivePerJoint = -0.005 / math.log(0.9)  # [s] of the fatigue
+    no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque; of the A1
     growth: PositivePerJoint = 1.0  # share of the torque limits, which changes in training
 
 
@@ -123,7 +130,7 @@ class EncoderCfg(ModelCfg):
     velocity_resolution: PositivePerJoint = 3.88e-3  # [rad/s]
 
 
-_ALL = (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg)
+_ALL = (IdealCfg, CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg)
 MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 
@@ -132,6 +139,7 @@ class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
     choices: dict[str, list[str]] = {"ideal": ["delay", "ideal"]}  # chains by name, for ``--motors``
+    ideal = IdealCfg  # any torque within the limits, at once
     drive = DriveCfg  # gains that the drive itself closes
     lag = LagCfg  # torques rise in a while
     friction = FrictionCfg  # in addition to that of the robot's file

@@ -24,6 +24,21 @@ def approach(dt: float, time_constant: float) -> float:
 
 
 @wp.struct
+class Ideal:
+    """Inputs of :func:`limited_torque`, (num_dof,)."""
+
+    lowest_torque: wp.array[float]
+    highest_torque: wp.array[float]
+
+
+@wp.func
+def limited_torque(m: Ideal, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.ideal`; NaN stays NaN, as in torch."""
+    low, high = m.lowest_torque[joint], m.highest_torque[joint]
+    return wp.where(wanted < low, low, wp.where(wanted > high, high, wanted))
+
+
+@wp.struct
 class Curve:
     """Inputs of :func:`curve_torque`, all of them (num_envs, num_dof)."""
 
@@ -147,9 +162,9 @@ def quantized_torque(m: Quantize, world: int, joint: int, substep: int, wanted: 
 class Muscle:
     """Inputs of :func:`muscle_torque`, (num_envs, num_dof) but for the highest torque (num_dof,)."""
 
-    response: wp.array2d[float]
+    activation_time: wp.array2d[float]
+    recovery_time: wp.array2d[float]
     no_load_speed: wp.array2d[float]
-    recovery: wp.array2d[float]
     growth: wp.array2d[float]
     activation: wp.array2d[float]
     fatigue: wp.array2d[float]
@@ -161,10 +176,11 @@ class Muscle:
 def muscle_torque(m: Muscle, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
     """Return the torque of :func:`~legged_torque.motors.formulas.muscle`."""
     limit, before = m.growth[world, joint] * m.highest_torque[joint], m.activation[world, joint]
-    activation = before + m.response[world, joint] * (wp.tanh(wanted / limit) - before)
+    activation = before + approach(m.dt, m.activation_time[world, joint]) * (wp.tanh(wanted / limit) - before)
     torque = activation * limit * (1.0 - wp.sign(activation) * vel / m.no_load_speed[world, joint])
     m.activation[world, joint] = activation
-    m.fatigue[world, joint] = m.recovery[world, joint] * (m.fatigue[world, joint] + wp.abs(torque) * m.dt)
+    left = 1.0 - approach(m.dt, m.recovery_time[world, joint])
+    m.fatigue[world, joint] = left * (m.fatigue[world, joint] + wp.abs(torque) * m.dt)
     return torque
 
 
@@ -184,6 +200,7 @@ def measured_state(m: Encoder, world: int, joint: int, pos: float, vel: float) -
 
 
 KERNELS = {
+    "ideal": limited_torque,
     "curve": curve_torque,
     "drive": drive_torque,
     "lag": lagging_torque,
@@ -210,7 +227,7 @@ class ModelMotor(Motor):
         super().__init__(cfg, joints)
         self.formula, self.kernel = FORMULAS[cfg._model], KERNELS[cfg._model]  # type: ignore[misc]
         self.values = SimpleNamespace(dt=joints.dt, decimation=joints.decimation, nominal_pose=joints.nominal_pose)
-        self.values.highest_torque = joints.torque_limits[1]
+        self.values.lowest_torque, self.values.highest_torque = joints.torque_limits
         for name, numbers in cfg.constants(joints.names, joints.section).items():
             rows = torch.tensor(numbers, device=self.device).expand(self.num_envs, -1)
             setattr(self.values, name, rows.clone() if name in cfg.draws else rows)

@@ -34,8 +34,7 @@ class MotorTwin:
             if without_function(described):
                 raise UserError(f"no numpy function for the motor '{link}'")
             motor, model = SimpleNamespace(**robot), described["model"]
-            if model in MODELS:
-                vars(motor).update(_constants(described, names, f"motors.{link}"))
+            vars(motor).update(_constants(described, names, f"motors.{link}"))
             self._links.append((FORMULAS[model], motor))
         check_encoders("motors", [link for link, described in links.items() if described["model"] == "encoder"])
         self._shape = (len(names),)
