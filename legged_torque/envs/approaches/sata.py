@@ -1,7 +1,8 @@
 """SATA: torques by muscles that are activated, tire and grow (Li et al., RSS 2025; marmotlab/SATA, go2_torque.py).
 
 The link ``muscle`` has the formulas. As there, lost measurements and actions leave the ones before; there, lost actions
-leave activations, too. Here the policy does not observe the trunk's velocity and torques.
+leave activations, too. Here the policy does not observe the trunk's velocity and torques. An export acts at 200 Hz, as
+grown robots do, with the torques of its checkpoint's age.
 """
 
 import torch
