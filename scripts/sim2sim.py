@@ -84,6 +84,8 @@ def main() -> None:
         motors = task_registry.get_cfgs(policy.description["task"])[0].motors
         motors.choose(args.motors)
         policy.description["motors"] = motors.describe()
+        for name, armature in motors.armature(policy.joint_order).items():
+            policy.description["joints"][name]["armature"] = armature
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])

@@ -18,7 +18,9 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import LeggedRobot, TorqueRobot
 from legged_torque.envs.approaches import (
     decap_config,
+    fast_config,
     multi_head_config,
+    sata_config,
     torque_config,
     torque_curriculum_config,
     torque_gravity,
@@ -36,7 +38,7 @@ from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-LINKS = ("Drive", "Lag", "Friction", "Thermal", "Quantize")
+LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
 SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
 """Where the settings of some classes stand."""
@@ -58,10 +60,13 @@ CONFIGS = (
     (multi_head_config, "TorqueMultiHeadCfg"),
     (multi_head_config, "MultiHeadCfg"),
     (multi_head_config, "MultiHeadCfgPPO"),
+    (fast_config, "FastCfg"),
+    (fast_config, "FastCfgPPO"),
     (multi_head_config, "MultiHeadTwoRatesCfg"),
-    (multi_head_config, "MultiHeadTwoRatesCfgPPO"),
     (variable_stiffness_config, "VariableStiffnessCfg"),
     (decap_config, "DecapCfg"),
+    (sata_config, "SataCfg"),
+    (sata_config, "SataCfgPPO"),
 )
 """Config classes in the order of the page."""
 

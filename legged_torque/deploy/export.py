@@ -239,7 +239,7 @@ def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:
     delays = [name for name, link in task.motors.links.items() if type(link) is ActionDelay and name in motors]
     if len(delays) == 1:
         latency["actions"] = motors.pop(delays[0])
-    if task.sensors.sensing:
+    if task.sensors.sensing and task.sensors.sensing.queue.is_needed:
         settings: Any = task.cfg.sensing.delay
         latency["measurements"] = settings.described()
     return latency
@@ -314,13 +314,15 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
         rates, angles, speeds, gravity, position, quat = (part[world].cpu().numpy() for part in parts)
         points = np.pad(policy.scan_places(position, quat), [(0, 0), (0, 1)], constant_values=position[2])
         in_world = torch.as_tensor(points, dtype=torch.float32, device=task.device)
-        state = State(rates, angles, speeds, gravity)
+        motors = MotorTwin(policy.description)
+        measured = motors.measured(angles, speeds)
+        state = State(rates, *measured, gravity)
         state.terms = {name: of_worlds[world] for name, of_worlds in values.items()}
         state.heights = task.terrain.height_above(in_world).cpu().numpy()
         policy.reset()
         policy.last_action = actions = task.actions[world].cpu().numpy()
         obs.append(policy.observation(state, task.commands[world].cpu().numpy()))
-        motors, asked = MotorTwin(policy.description), policy.wanted_torques(actions, angles, speeds)
+        asked = policy.wanted_torques(actions, *measured)
         torques.append([motors.apply(asked, angles, speeds) for _ in range(NUM_SUBSTEPS)][-1])
     seen, expected = np.array(obs), torch.cat([task.obs_buf[name] for name in model.obs_groups], dim=1).cpu().numpy()
     is_scan = np.array(columns(policy.description["observations"])) == "height_scan"

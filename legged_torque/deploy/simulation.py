@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy.latency import Latency
-from legged_torque.deploy.policy import Policy
+from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.utils.errors import UserError
@@ -106,7 +106,7 @@ class Simulation:
         """Observe, act, and apply torques in all physics steps of a control step; keep their mean power [W]."""
         policy, robot = self.policy, self.robot
         is_late = self._measurements.is_needed
-        state = dataclasses.replace(self._measurements.received(self._now)) if is_late else robot.state()
+        state = dataclasses.replace(self._measurements.received(self._now)) if is_late else self._measured()
         places = policy.scan_places(robot.position, robot.quat)
         self._heights.append(robot.position[2] - robot.ground_heights(places))
         state.heights = self._heights[0]  # the oldest, of this episode
@@ -117,13 +117,13 @@ class Simulation:
             pos, vel = robot.joint_positions(), robot.joint_velocities()
             if i == 0 or self._timing["refresh_torques"]:
                 actions = self._actions.received(self._now)
-                wanted = policy.wanted_torques(actions, pos, vel)
+                wanted = policy.wanted_torques(actions, *self._motors.measured(pos, vel))
             robot.step(self._motors.apply(wanted, pos, vel))
-            applied = robot.applied_torques()
+            applied = self._motors.before_friction(robot.applied_torques())
             self._power += np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
             self._now += 1
             if is_late:
-                self._measurements.send(self._now, robot.state())
+                self._measurements.send(self._now, self._measured())
         self._power /= self._timing["decimation"]
         self._steps += 1
 
@@ -167,7 +167,13 @@ class Simulation:
         self._heights.clear()
         self._steps = self._now = 0
         self._actions.restart(self._rng, self.policy.last_action.copy())
-        self._measurements.restart(self._rng, self.robot.state())
+        self._measurements.restart(self._rng, self._measured())
+
+    def _measured(self) -> State:
+        """Return what sensors measure now."""
+        state = self.robot.state()
+        pos, vel = self._motors.measured(state.joint_positions, state.joint_velocities)
+        return dataclasses.replace(state, joint_positions=pos, joint_velocities=vel)
 
     def _drawn(self, limits: list[float], size: int | None = None) -> Any:
         """Return one or ``size`` numbers that are drawn uniformly from [lowest, highest]."""

@@ -13,6 +13,7 @@ from typing import Any
 from legged_torque.envs import robots
 from legged_torque.envs.approaches import decap_config as decap
 from legged_torque.envs.approaches import multi_head_config as multi_head
+from legged_torque.envs.approaches import sata_config as sata
 from legged_torque.envs.approaches import torque_config as torque
 from legged_torque.envs.approaches import torque_curriculum_config as torque_curriculum
 from legged_torque.envs.approaches import torque_gravity
@@ -86,6 +87,14 @@ class A1VariableStiffnessCfgPPO(stiffness.VariableStiffnessCfgPPO, A1CfgPPO):
     """Its training."""
 
 
+class A1SataCfg(sata.SataCfg, A1TorqueCfg):
+    """A1 with torques by muscles that grow."""
+
+
+class A1SataCfgPPO(sata.SataCfgPPO, A1CfgPPO):
+    """Its training."""
+
+
 class A1DecapCfg(decap.DecapCfg, A1TorqueCfg):
     """A1 with torques and a PD bias that decays."""
 
@@ -97,6 +106,7 @@ _MULTI_HEAD = "legged_torque.envs.approaches.multi_head:MultiHeadRobot"
 _CURRICULUM_MULTI_HEAD = "legged_torque.envs.approaches.multi_head:CurriculumMultiHeadRobot"
 _TWO_RATES = "legged_torque.envs.approaches.multi_head:MultiHeadTwoRatesRobot"
 _STIFFNESS = "legged_torque.envs.approaches.variable_stiffness:VariableStiffnessRobot"
+_SATA = "legged_torque.envs.approaches.sata:SataRobot"
 _DECAP = "legged_torque.envs.approaches.decap:DecapRobot"
 
 A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
@@ -107,6 +117,7 @@ A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], 
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
     ("a1_variable_stiffness", _STIFFNESS, A1VariableStiffnessCfg, A1VariableStiffnessCfgPPO),
     ("a1_decap", _DECAP, A1DecapCfg, A1TorqueCfgPPO),
+    ("a1_sata", _SATA, A1SataCfg, A1SataCfgPPO),
 )
 """Tasks of the A1 on a plane that no other robot has, or in another way: name, class, settings and training."""
 
@@ -176,6 +187,7 @@ PURPOSES = {
     "multihead_two_rates": "positions 50 Hz, torques 200 Hz",
     "variable_stiffness": "positions and stiffness",
     "decap": "torques, PD bias decays",
+    "sata": "torques by muscles that grow",
 }
 """What the tasks of an approach are, for lists."""
 

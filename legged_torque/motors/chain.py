@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.config import MotorCfg, check_encoders
 from legged_torque.motors.joints import Joints
 from legged_torque.motors.kernel import Part, newest_actions, torque_kernel
 from legged_torque.motors.motor import Motor
@@ -21,6 +21,7 @@ class MotorChain:
 
     Attributes:
         links: The links by name.
+        encoder: The link that acts on measurements; None if they are exact.
         strength: Factors on the desired torques, drawn at random. Shape: (num_envs, num_dof).
     """
 
@@ -38,10 +39,13 @@ class MotorChain:
                 raise UserError(f"motors.chain has the link '{name}' twice; give the second one a section of its own")
             own = dataclasses.replace(joints, section=f"motors.{name}")
             self.links[name] = getattr(settings, name).build(own)
-        self._of_actions, self._of_torques = (
-            [link for link in self.links.values() if link.acts_on == kind] for kind in ("actions", "torques")
+        self._of_actions, self._behind_law = (
+            [link for link in self.links.values() if (link.acts_on == "actions") == early] for early in (True, False)
         )
-        if list(self.links.values()) != [*self._of_actions, *self._of_torques]:
+        encoders = {name: link for name, link in self.links.items() if link.acts_on == "measurements"}
+        check_encoders("motors.chain", list(encoders))
+        self.encoder: Any = next(iter(encoders.values()), None)
+        if list(self.links.values()) != [*self._of_actions, *self._behind_law]:
             raise UserError(f"motors.chain must have links that act on actions first, not {', '.join(self.links)}")
         self.strength = torch.ones(joints.num_envs, len(joints.names), device=joints.device)
         self._actions = joints.actions
@@ -58,14 +62,30 @@ class MotorChain:
             actions = link.apply(actions, pos, vel, substep)
         return actions
 
+    def measured(self, pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what control laws have of joint positions [rad] and velocities [rad/s].
+
+        Shapes: (num_envs, num_dof).
+        """
+        return self.encoder.measured(pos, vel) if self.encoder else (pos, vel)
+
     def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
         """Return the torques that joints get of those that a control law asks for [N m].
 
         Called once per physics step; arguments as of :meth:`~legged_torque.motors.motor.Motor.apply`.
         """
-        torques = self.strength * wanted
-        for link in self._of_torques:
-            torques = link.apply(torques, pos, vel, substep)
+        torques, state = self.strength * wanted, self.measured(pos, vel)
+        for link in self._behind_law:
+            if link is self.encoder:
+                state = pos, vel
+            else:
+                torques = link.apply(torques, *state, substep)
+        return torques
+
+    def before_friction(self, torques: Tensor) -> Tensor:
+        """Return what motors have made of torques that joints have got in a physics step [N m]; shapes as of them."""
+        for link in self.links.values():
+            torques = torques if link.lost is None else torques + link.lost
         return torques
 
     def kernel(self, law: Part) -> Part | None:
@@ -75,11 +95,9 @@ class MotorChain:
         """
         if len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
             return None
-        of_actions, of_torques = (
-            [(link.kernel, link.kernel_reads()) for link in links] for links in (self._of_actions, self._of_torques)
-        )
-        actions: Any = of_actions[0] if of_actions else (newest_actions, self._actions)
-        return torque_kernel(law, self.strength, actions, of_torques)
+        parts = {link: (link.kernel, link.kernel_reads()) for link in self.links.values()}
+        actions: Any = parts[self._of_actions[0]] if self._of_actions else (newest_actions, self._actions)
+        return torque_kernel(law, self.strength, actions, [(link.acts_on, parts[link]) for link in self._behind_law])
 
     def reset(self, mask: Tensor) -> None:
         """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""

@@ -59,16 +59,6 @@ class DelayCfg(LatencyCfg, MotorCfg):
     _motor_class = "legged_torque.motors.delay:ActionDelay"
 
 
-class IdealCfg(MotorCfg):
-    """Settings of :class:`~legged_torque.motors.ideal.IdealMotor`: any torque within the limits, at once."""
-
-    _motor_class = "legged_torque.motors.ideal:IdealMotor"
-
-    def describe(self) -> dict[str, Any]:
-        """Return the name of the model; ``policy.yaml`` has its limits anyway."""
-        return {"model": "ideal"}
-
-
 class PerturbationCfg(MotorCfg):
     """Settings of :class:`~legged_torque.motors.perturbation.TorquePerturbation`, which perturbs torques."""
 
@@ -77,6 +67,12 @@ class PerturbationCfg(MotorCfg):
     offset: NotNegative = 1.0
     of_pos: NotNegative = 1.0  # [1/rad]
     of_vel: NotNegative = 0.1  # [s/rad]
+
+
+def check_encoders(where: str, names: Sequence[str]) -> None:
+    """Raise a UserError if there are several links that act on measurements."""
+    if len(names) > 1:
+        raise UserError(f"{where} must have one encoder at most, not {', '.join(names)}")
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:

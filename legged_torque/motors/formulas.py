@@ -54,23 +54,25 @@ def drive(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, di
 
 def lag(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
     """First-order lag with ``time_constant`` [s], exact for torques that stay the same during a physics step."""
-    torque = motor.torque + _approach(xp, motor) * (wanted - motor.torque)
+    torque = motor.torque + _approach(xp, motor.dt, motor.time_constant) * (wanted - motor.torque)
     return torque, {"torque": torque}
 
 
 def friction(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
     """Static, Coulomb and viscous friction.
 
-    ``wanted - dry tanh(vel / activation_speed) - viscous vel`` with ``dry = coulomb + load |wanted| + (static -
-    coulomb) exp(-(vel / stribeck_speed)^2)``, in N m and N m s/rad. With static = coulomb it is that of unitree_rl_lab
-    (Fs, Fd, Va). Stribeck and load are of BAM (github.com/Rhoban/bam), whose load is the torque on the gears, the
-    motor's less the one from outside; only the motor's is known here. It is an explicit force: where static friction
-    over ``activation_speed``, times the physics step, exceeds a joint's inertia, the joint trembles around rest.
+    ``wanted - lost``, where ``lost = dry tanh(vel / activation_speed) + viscous vel`` and ``dry = coulomb + load
+    |wanted| + (static - coulomb) exp(-(vel / stribeck_speed)^2)``, in N m and N m s/rad. With static = coulomb it is
+    that of unitree_rl_lab (Fs, Fd, Va). Stribeck and load are of BAM (github.com/Rhoban/bam), whose load is the torque
+    on the gears, the motor's less the one from outside; only the motor's is known here. It is an explicit force: where
+    static friction over ``activation_speed``, times the physics step, exceeds a joint's inertia, the joint trembles
+    around rest.
     """
     stribeck = xp.exp(-((vel / motor.stribeck_speed) ** 2))
     dry = motor.coulomb_friction + motor.load_friction * xp.abs(wanted)
     dry = dry + (motor.static_friction - motor.coulomb_friction) * stribeck
-    return wanted - dry * xp.tanh(vel / motor.activation_speed) - motor.viscous_friction * vel, {}
+    lost = dry * xp.tanh(vel / motor.activation_speed) + motor.viscous_friction * vel
+    return wanted - lost, {"lost": lost}
 
 
 def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
@@ -83,7 +85,8 @@ def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, 
     share = xp.clip((continuous - rms) / xp.clip(continuous * (1.0 - motor.derating_from), SMALL, None), 0.0, 1.0)
     most = continuous + share * xp.clip(motor.highest_torque - continuous, 0.0, None)
     torque = xp.clip(wanted, -most, most)
-    return torque, {"mean_square": motor.mean_square + _approach(xp, motor) * (torque**2 - motor.mean_square)}
+    share = _approach(xp, motor.dt, motor.time_constant)
+    return torque, {"mean_square": motor.mean_square + share * (torque**2 - motor.mean_square)}
 
 
 def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
@@ -91,18 +94,46 @@ def quantize(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any,
     return motor.resolution * xp.round(wanted / motor.resolution), {}
 
 
-def _approach(xp: Any, motor: Any) -> Any:
-    """Return the share of the way to a constant input that a first-order lag goes in a physics step."""
-    return 1.0 - xp.exp(-motor.dt / xp.clip(motor.time_constant, SMALL, None))
+def muscle(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """A muscle that is activated and tires (SATA: Li et al., RSS 2025; marmotlab/SATA, go2_torque.py).
+
+    Its limit is ``growth`` times the robot's highest torque. The activation follows ``tanh(wanted / limit)`` with
+    ``activation_time`` [s], and the torque is ``activation limit (1 - sign(activation) vel / no_load_speed)``. The
+    fatigue [N m s] is the sum of |torque| dt, of which each physics step leaves ``exp(-dt / recovery_time)``. The
+    authors' figures are 0.6 of the way and 0.9 left per step of 5 ms.
+    """
+    limit = motor.growth * motor.highest_torque
+    share = _approach(xp, motor.dt, motor.activation_time)
+    activation = motor.activation + share * (xp.tanh(wanted / limit) - motor.activation)
+    torque = activation * limit * (1.0 - xp.sign(activation) * vel / motor.no_load_speed)
+    fatigue = (1.0 - _approach(xp, motor.dt, motor.recovery_time)) * (motor.fatigue + xp.abs(torque) * motor.dt)
+    return torque, {"activation": activation, "fatigue": fatigue}
+
+
+def encoder(xp: Any, motor: Any, pos: Any, vel: Any) -> tuple[Any, Any]:
+    """Positions and velocities as multiples of ``position_resolution`` [rad] and ``velocity_resolution`` [rad/s].
+
+    Policy, control law and the links before this one have them, and those behind it the true ones. The defaults are of
+    the messages of Unitree's GO-M8010-6 (unitree_actuator_sdk): 2 pi / 32768 rad and 2 pi / 256 rad/s of a rotor whose
+    gear is 6.33.
+    """
+    position, velocity = motor.position_resolution, motor.velocity_resolution
+    return position * xp.round(pos / position), velocity * xp.round(vel / velocity)
+
+
+def _approach(xp: Any, dt: Any, time_constant: Any) -> Any:
+    """Return the share of the way to a constant input that a first-order lag goes in ``dt`` [s]."""
+    return 1.0 - xp.exp(-dt / xp.clip(time_constant, SMALL, None))
 
 
 @dataclass(frozen=True)
 class Formula:
     """A formula and what it keeps."""
 
-    function: Callable[..., tuple[Any, dict[str, Any]]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state
+    function: Callable[..., tuple[Any, Any]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state by name
     state: tuple[str, ...] = ()  # names of arrays, 0 at the start of an episode
     begin: Callable[..., dict[str, Any]] | None = None  # (xp, motor) -> new state, before a control step
+    is_encoder: bool = False  # whether the function is (xp, motor, pos, vel) -> both as they are measured
 
 
 FORMULAS = {
@@ -110,8 +141,10 @@ FORMULAS = {
     "curve": Formula(curve, ("power", "dip"), sag),
     "drive": Formula(drive),
     "lag": Formula(lag, ("torque",)),
-    "friction": Formula(friction),
+    "friction": Formula(friction, ("lost",)),
     "thermal": Formula(thermal, ("mean_square",)),
     "quantize": Formula(quantize),
+    "muscle": Formula(muscle, ("activation", "fatigue")),
+    "encoder": Formula(encoder, is_encoder=True),
 }
 """The formulas by name, as ``policy.yaml`` has it under ``model``."""

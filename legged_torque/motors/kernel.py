@@ -37,19 +37,19 @@ def control_law(terms: Sequence[tuple[Part, Tensor | None]], num_dof: int) -> Pa
     return total
 
 
-def torque_kernel(law: Part, strength: Tensor, actions: Part, links: Sequence[Part]) -> Part:
+def torque_kernel(law: Part, strength: Tensor, actions: Part, links: Sequence[tuple[str, Part]]) -> Part:
     """Return the torque of a joint as ``Engine.drive`` takes it, ``(reads, world, joint, substep, pos, vel)`` [N m].
 
     Args:
         law: As of :func:`control_law`.
         strength: Factors on what the law asks for. Shape: (num_envs, num_dof).
         actions: A link that acts on actions, or :func:`newest_actions` with the actions (num_envs, num_actions).
-        links: Further links, see :attr:`~legged_torque.motors.motor.Motor.kernel`.
+        links: What further links act on and their kernels, see :class:`~legged_torque.motors.motor.Motor`.
     """
     function, struct = _strengthened(law[0], actions[0])
     reads = read(struct, law=law[1], strength=strength, actions=actions[1])
-    for link, link_reads in links:
-        function, struct = _behind(function, link)
+    for acts_on, (link, link_reads) in links:
+        function, struct = (_through if acts_on == "measurements" else _behind)(function, link)
         reads = read(struct, before=reads, link=link_reads)
     return function, reads
 
@@ -123,6 +123,19 @@ def _behind(before: wp.Function, link: wp.Function) -> tuple[wp.Function, Any]:
         return link(reads.link, world, joint, substep, wanted, pos, vel)
 
     return link_torque, Reads
+
+
+@functools.cache
+def _through(before: wp.Function, link: wp.Function) -> tuple[wp.Function, Any]:
+    """Return the function of links that have positions and velocities from another one."""
+    Reads = _struct("MeasuredReads", before=struct_of(before), link=struct_of(link))
+
+    @wp.func
+    def measured_torque(reads: Reads, world: int, joint: int, substep: int, pos: float, vel: float) -> float:
+        state = link(reads.link, world, joint, pos, vel)
+        return before(reads.before, world, joint, substep, state[0], state[1])
+
+    return measured_torque, Reads
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -17,15 +18,16 @@ ASSUMED_VOLTAGE: Draws = {"voltage": {"set": [0.85, 1.05]}}
 
 
 class ModelCfg(MotorCfg):
-    """Settings of a :class:`~legged_torque.motors.models.ModelMotor`; all but ``draws`` are constants by joint."""
+    """Settings of a :class:`~legged_torque.motors.models.ModelMotor`; its constants are by joint."""
 
     _motor_class = "legged_torque.motors.models:ModelMotor"
     _model = ""  # name of its formula, see ``motors.formulas``
+    _others: tuple[str, ...] = ("draws",)  # settings that are no constants of the formula
     draws: Draws = {}  # of constants by name, each one number per world: ranges as in ``domain_rand``
 
     def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
         """Return the numbers of all joints by constant; a UserError names what joints or ``draws`` do not have."""
-        names = [name for name in section_keys(self) if name != "draws"]
+        names = [name for name in section_keys(self) if name not in self._others]
         for name in self.draws:
             if name not in names:
                 raise unknown_name(f"{path}.draws", name, names)
@@ -33,21 +35,27 @@ class ModelCfg(MotorCfg):
 
     def describe(self) -> dict[str, Any]:
         """Return model and constants for ``policy.yaml``."""
-        settings = to_dict(self)
-        del settings["draws"]
+        settings = {name: value for name, value in to_dict(self).items() if name not in self._others}
         return {"model": self._model} | settings
+
+
+class IdealCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.ideal`: any torque within the limits, at once."""
+
+    _model = "ideal"
 
 
 class CurveCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.curve`: how much torque at which speed; as they are, any."""
 
-    _model = "curve"
+    _model, _others = "curve", ("draws", "armature")
     knee_speed: PerJoint = 1e9  # [rad/s] X1, up to which a motor has its whole torque
     no_load_speed: PerJoint = 1e9  # [rad/s] X2, at which it has none
     driving_torque: PerJoint = 1e9  # [N m] Y1, most with the motion
     braking_torque: PerJoint = 1e9  # [N m] Y2, most against it
     voltage: PerJoint = 1.0  # of the bus, as a share of the nominal one
     sag: PerJoint = 0.0  # [1/kW] share of the voltage lost per mechanical power of all joints
+    armature: PerJoint | None = None  # [kg m^2] of the rotors through their gears; None: that of the robot's file
 
     def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
         """Return the numbers of all joints; a UserError if one has its knee beyond the no-load speed."""
@@ -102,7 +110,28 @@ class QuantizeCfg(ModelCfg):
     resolution: PositivePerJoint = 0.01  # [N m]
 
 
-MODELS = {cfg._model: cfg for cfg in (CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg)}
+class MuscleCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.muscle`, see :mod:`legged_torque.envs.approaches.sata`."""
+
+    _motor_class = "legged_torque.motors.models:MuscleModel"
+    _model = "muscle"
+    activation_time: PositivePerJoint = -0.005 / math.log(0.4)  # [s] time constant of the activation
+    recovery_time: PositivePerJoint = -0.005 / math.log(0.9)  # [s] of the fatigue
+    no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque; of the A1
+    growth: PositivePerJoint = 1.0  # share of the torque limits, which changes in training
+
+
+class EncoderCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.encoder`: steps of what joint encoders measure."""
+
+    _motor_class = "legged_torque.motors.models:EncoderModel"
+    _model = "encoder"
+    position_resolution: PositivePerJoint = 3.03e-5  # [rad]
+    velocity_resolution: PositivePerJoint = 3.88e-3  # [rad/s]
+
+
+_ALL = (IdealCfg, CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg)
+MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 
 
@@ -110,17 +139,28 @@ class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
     choices: dict[str, list[str]] = {"ideal": ["delay", "ideal"]}  # chains by name, for ``--motors``
+    ideal = IdealCfg  # any torque within the limits, at once
     drive = DriveCfg  # gains that the drive itself closes
     lag = LagCfg  # torques rise in a while
     friction = FrictionCfg  # in addition to that of the robot's file
     thermal = ThermalCfg  # less torque after a long load
     quantize = QuantizeCfg  # steps of torques
+    encoder = EncoderCfg  # steps of measurements, for policy, control law and the links before it
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
         if name not in self.choices:
             raise unknown_name("motors", name, self.choices)
         self.chain = list(self.choices[name])
+
+    def armature(self, dof_names: Sequence[str]) -> dict[str, float]:
+        """Return the armatures of motors in the chain by joint [kg m^2], of several the last; none: the file's."""
+        found: dict[str, float] = {}
+        for name in self.chain:
+            values = getattr(getattr(self, name, None), "armature", None)
+            if values is not None:
+                found = dict(zip(dof_names, by_joint(f"motors.{name}.armature", values, dof_names), strict=True))
+        return found
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""

@@ -24,6 +24,21 @@ def approach(dt: float, time_constant: float) -> float:
 
 
 @wp.struct
+class Ideal:
+    """Inputs of :func:`limited_torque`, (num_dof,)."""
+
+    lowest_torque: wp.array[float]
+    highest_torque: wp.array[float]
+
+
+@wp.func
+def limited_torque(m: Ideal, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.ideal`; NaN stays NaN, as in torch."""
+    low, high = m.lowest_torque[joint], m.highest_torque[joint]
+    return wp.where(wanted < low, low, wp.where(wanted > high, high, wanted))
+
+
+@wp.struct
 class Curve:
     """Inputs of :func:`curve_torque`, all of them (num_envs, num_dof)."""
 
@@ -92,6 +107,7 @@ class Friction:
     load_friction: wp.array2d[float]
     stribeck_speed: wp.array2d[float]
     activation_speed: wp.array2d[float]
+    lost: wp.array2d[float]
 
 
 @wp.func
@@ -100,7 +116,9 @@ def friction_torque(m: Friction, world: int, joint: int, substep: int, wanted: f
     relative, coulomb = vel / m.stribeck_speed[world, joint], m.coulomb_friction[world, joint]
     dry = coulomb + m.load_friction[world, joint] * wp.abs(wanted)
     dry += (m.static_friction[world, joint] - coulomb) * wp.exp(-relative * relative)
-    return wanted - dry * wp.tanh(vel / m.activation_speed[world, joint]) - m.viscous_friction[world, joint] * vel
+    lost = dry * wp.tanh(vel / m.activation_speed[world, joint]) + m.viscous_friction[world, joint] * vel
+    m.lost[world, joint] = lost
+    return wanted - lost
 
 
 @wp.struct
@@ -140,13 +158,57 @@ def quantized_torque(m: Quantize, world: int, joint: int, substep: int, wanted: 
     return m.resolution[world, joint] * wp.rint(wanted / m.resolution[world, joint])
 
 
+@wp.struct
+class Muscle:
+    """Inputs of :func:`muscle_torque`, (num_envs, num_dof) but for the highest torque (num_dof,)."""
+
+    activation_time: wp.array2d[float]
+    recovery_time: wp.array2d[float]
+    no_load_speed: wp.array2d[float]
+    growth: wp.array2d[float]
+    activation: wp.array2d[float]
+    fatigue: wp.array2d[float]
+    highest_torque: wp.array[float]
+    dt: float
+
+
+@wp.func
+def muscle_torque(m: Muscle, world: int, joint: int, substep: int, wanted: float, pos: float, vel: float) -> float:
+    """Return the torque of :func:`~legged_torque.motors.formulas.muscle`."""
+    limit, before = m.growth[world, joint] * m.highest_torque[joint], m.activation[world, joint]
+    activation = before + approach(m.dt, m.activation_time[world, joint]) * (wp.tanh(wanted / limit) - before)
+    torque = activation * limit * (1.0 - wp.sign(activation) * vel / m.no_load_speed[world, joint])
+    m.activation[world, joint] = activation
+    left = 1.0 - approach(m.dt, m.recovery_time[world, joint])
+    m.fatigue[world, joint] = left * (m.fatigue[world, joint] + wp.abs(torque) * m.dt)
+    return torque
+
+
+@wp.struct
+class Encoder:
+    """Inputs of :func:`measured_state`, (num_envs, num_dof)."""
+
+    position_resolution: wp.array2d[float]
+    velocity_resolution: wp.array2d[float]
+
+
+@wp.func
+def measured_state(m: Encoder, world: int, joint: int, pos: float, vel: float) -> wp.vec2:
+    """Return position and velocity of :func:`~legged_torque.motors.formulas.encoder`."""
+    position, velocity = m.position_resolution[world, joint], m.velocity_resolution[world, joint]
+    return wp.vec2(position * wp.rint(pos / position), velocity * wp.rint(vel / velocity))
+
+
 KERNELS = {
+    "ideal": limited_torque,
     "curve": curve_torque,
     "drive": drive_torque,
     "lag": lagging_torque,
     "friction": friction_torque,
     "thermal": derated_torque,
     "quantize": quantized_torque,
+    "muscle": muscle_torque,
+    "encoder": measured_state,
 }
 """The Warp functions of formulas, by name."""
 
@@ -165,12 +227,13 @@ class ModelMotor(Motor):
         super().__init__(cfg, joints)
         self.formula, self.kernel = FORMULAS[cfg._model], KERNELS[cfg._model]  # type: ignore[misc]
         self.values = SimpleNamespace(dt=joints.dt, decimation=joints.decimation, nominal_pose=joints.nominal_pose)
-        self.values.highest_torque = joints.torque_limits[1]
+        self.values.lowest_torque, self.values.highest_torque = joints.torque_limits
         for name, numbers in cfg.constants(joints.names, joints.section).items():
             rows = torch.tensor(numbers, device=self.device).expand(self.num_envs, -1)
             setattr(self.values, name, rows.clone() if name in cfg.draws else rows)
         for name in self.formula.state:
             setattr(self.values, name, self.buffer(name, len(joints.names)))
+        self.lost = self._buffers.get("lost")
 
     def send(self, actions: Tensor) -> None:
         """Begin a control step."""
@@ -206,3 +269,27 @@ class ModelMotor(Motor):
             RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
             for name, draw in draws.items()
         ]
+
+
+class MuscleModel(ModelMotor):
+    """A link whose torque limits grow in training."""
+
+    def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
+        """Give the growth memory of its own. Errors as of ``cfg.constants``."""
+        super().__init__(cfg, joints)
+        self.values.growth = self.values.growth.clone()
+
+    def describe(self) -> dict[str, Any]:
+        """Return model and constants, and the growth of this moment of training."""
+        growth = self.values.growth[0].tolist()
+        return super().describe() | {"growth": dict(zip(self.joints.names, growth, strict=True))}
+
+
+class EncoderModel(ModelMotor):
+    """A link that changes what is measured of joints."""
+
+    acts_on = "measurements"
+
+    def measured(self, pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor]:
+        """Return positions [rad] and velocities [rad/s] as they are measured. Shapes: (num_envs, num_dof)."""
+        return self.formula.function(torch, self.values, pos, vel)

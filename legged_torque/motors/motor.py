@@ -20,13 +20,20 @@ class Motor(Buffers):
     """
 
     acts_on: ClassVar[str] = "torques"
-    """"torques", those that the control law asks for, or "actions", before the control law sees them."""
+    """"torques", those that the control law asks for, "actions", before the control law sees them, or "measurements".
+
+    The last is for a single link with a method ``measured``, see :class:`~legged_torque.motors.models.EncoderModel`.
+    """
     kernel: ClassVar[Any] = None
     """A Warp function that does the same as :meth:`apply` for one joint of one world, inside the physics kernel.
 
     Of torques: ``(reads, world, joint, substep, wanted, pos, vel) -> torque [N m]``, where ``reads`` is the struct that
-    :meth:`kernel_reads` returns. Of actions: ``(reads, world, substep) -> row of actions``.
+    :meth:`kernel_reads` returns. Of actions: ``(reads, world, substep) -> row of actions``. Of measurements: ``(reads,
+    world, joint, pos, vel) -> wp.vec2`` of both.
     """
+
+    lost: Tensor | None = None
+    """What friction took from the torques in the last physics step [N m], for metrics. Shape: (num_envs, num_dof)."""
 
     def __init__(self, cfg: MotorCfg, joints: Joints) -> None:
         """Create the motors of all worlds."""

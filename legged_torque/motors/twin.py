@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from legged_torque.motors.config import check_encoders
 from legged_torque.motors.formulas import FORMULAS
 from legged_torque.motors.model_config import MODELS
 from legged_torque.utils.config import update_from_dict
@@ -27,14 +28,15 @@ class MotorTwin:
         robot = {"lowest_torque": limits[0], "highest_torque": limits[1], "decimation": timing["decimation"]}
         robot |= {"dt": np.float32(1.0 / timing["physics_frequency"])}
         robot |= {"nominal_pose": np.array([description["nominal_pose"][name] for name in names], np.float32)}
+        links = description.get("motors") or {"ideal": {"model": "ideal"}}
         self._links = []
-        for link, described in (description.get("motors") or {"ideal": {"model": "ideal"}}).items():
+        for link, described in links.items():
             if without_function(described):
                 raise UserError(f"no numpy function for the motor '{link}'")
             motor, model = SimpleNamespace(**robot), described["model"]
-            if model in MODELS:
-                vars(motor).update(_constants(described, names, f"motors.{link}"))
+            vars(motor).update(_constants(described, names, f"motors.{link}"))
             self._links.append((FORMULAS[model], motor))
+        check_encoders("motors", [link for link, described in links.items() if described["model"] == "encoder"])
         self._shape = (len(names),)
         self.reset()
 
@@ -55,10 +57,25 @@ class MotorTwin:
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,).
         """
         torques, pos, vel = (np.asarray(values, np.float32) for values in (wanted, pos, vel))
+        state = self.measured(pos, vel)
         for formula, motor in self._links:
-            torques, state = formula.function(np, motor, torques, pos, vel)
-            vars(motor).update(state)
+            if formula.is_encoder:
+                state = pos, vel
+            else:
+                torques, kept = formula.function(np, motor, torques, *state)
+                vars(motor).update(kept)
         return torques
+
+    def before_friction(self, torques: np.ndarray) -> np.ndarray:
+        """Return what motors have made of torques that joints have got in a physics step [N m]. Shape: (joints,)."""
+        return torques + sum(motor.lost for formula, motor in self._links if "lost" in formula.state)
+
+    def measured(self, pos: np.ndarray, vel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return what control laws have of joint positions [rad] and velocities [rad/s]. Shapes: (joints,)."""
+        for formula, motor in self._links:
+            if formula.is_encoder:
+                return formula.function(np, motor, np.asarray(pos, np.float32), np.asarray(vel, np.float32))
+        return pos, vel
 
 
 def without_function(described: dict[str, Any]) -> bool:

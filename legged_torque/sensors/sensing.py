@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.state import RobotState
+from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.config import LatencyCfg
 from legged_torque.sim.packets import PacketQueue
 from legged_torque.utils.math import quat_rotate_inverse
@@ -20,9 +21,9 @@ class Sensing:
         queue: The measurements on their way: trunk orientation, dof_pos, base_ang_vel and dof_vel.
     """
 
-    def __init__(self, cfg: LatencyCfg, state: RobotState, dt: float, decimation: int) -> None:
+    def __init__(self, cfg: LatencyCfg, state: RobotState, motors: MotorChain, dt: float, decimation: int) -> None:
         """Allocate room for the longest delay; a UserError if it is not a whole number of physics steps."""
-        self._state, num_dof = state, state.dof_pos.shape[1]
+        self._state, self._motors, num_dof = state, motors, state.dof_pos.shape[1]
         self._measured = 0
         times, jitter, unit_steps = cfg.counted("sensing.delay", dt, decimation)
         self.queue = PacketQueue(self._packet(), 1, times, unit_steps, jitter, cfg.loss)
@@ -51,7 +52,7 @@ class Sensing:
 
     def look(self) -> None:
         """Write what has arrived."""
-        self._arrived.copy_(self.queue.received())
+        self._arrived.copy_(self.queue.received() if self.queue.is_needed else self._packet())
 
     @property
     def projected_gravity(self) -> Tensor:
@@ -60,4 +61,6 @@ class Sensing:
 
     def _packet(self) -> Tensor:
         """Return a measurement of this moment. Shape: (num_envs, 7 + 2 num_dof)."""
-        return torch.cat([self._state.qpos[:, 3:], self._state.qvel[:, 3:]], dim=1)
+        state = self._state
+        pos, vel = self._motors.measured(state.dof_pos, state.dof_vel)
+        return torch.cat([state.base_quat, pos, state.base_ang_vel, vel], dim=1)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.state import RobotState
+from legged_torque.motors.chain import MotorChain
 from legged_torque.sensors.config import SensorCfg
 from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.sensors.sensing import Sensing
@@ -20,12 +21,15 @@ class Sensors(dict[str, Sensor]):
 
     Attributes:
         height_scan: The height scan; None on a plane.
-        sensing: Joint encoders and IMU; None if what they measure is not late.
+        sensing: Joint encoders and IMU; None if what they measure is exact and not late.
         has_kernels: Whether some of them launch kernels of Warp, which cannot be compiled with torch's operations.
     """
 
-    def __init__(self, cfg: Any, state: RobotState) -> None:
-        """Build the sensors of the sections ``sensors``, ``terrain`` and ``sensing`` of a task's settings."""
+    def __init__(self, cfg: Any, state: RobotState, motors: MotorChain) -> None:
+        """Build the sensors of the sections ``sensors``, ``terrain`` and ``sensing`` of a task's settings.
+
+        ``motors`` have the joint encoders.
+        """
         sections = {name: value for name, value in vars(cfg.sensors).items() if isinstance(value, SensorCfg)}
         super().__init__({name: section.build(state) for name, section in sections.items()})
         self.height_scan = HeightScan(cfg.terrain, state) if state.ground.map is not None else None
@@ -34,12 +38,12 @@ class Sensors(dict[str, Sensor]):
         for sensor in self.values():
             sensor.has_noise = cfg.noise.add_noise
         self.has_kernels = not all(sensor.compilable for sensor in self.values())
-        sensing = Sensing(cfg.sensing.delay, state, cfg.sim.dt, cfg.control.decimation)
-        self.sensing = sensing if sensing.queue.is_needed else None
+        sensing = Sensing(cfg.sensing.delay, state, motors, cfg.sim.dt, cfg.control.decimation)
+        self.sensing = sensing if sensing.queue.is_needed or motors.encoder else None
 
     def begin_step(self) -> list[Callable[[], None]]:
         """Begin a control step; return what to call after each physics step, if sensors measure then."""
-        if not self.sensing:
+        if not self.sensing or not self.sensing.queue.is_needed:
             return []
         self.sensing.begin()
         return [self.sensing.measure]

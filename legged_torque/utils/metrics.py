@@ -9,8 +9,8 @@ world was reset are left out, but for the count of falls.
 - collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
   control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
   push sideways: 127 N in the nominal pose.
-- mechanical_power: mean of sum |tau_i qd_i| over all physics steps [W]. cost_of_transport: this mean over m g times
-  mean horizontal speed, with the nominal m g.
+- mechanical_power: mean of sum |tau_i qd_i| over all physics steps [W], tau_i being what a motor makes before its own
+  friction. cost_of_transport: this mean over m g times mean horizontal speed, with the nominal m g.
 - electrical_power, electrical_cost: the same with copper losses, mean of sum |tau_i qd_i| + c_i tau_i^2 [W], if
   ``control.copper_loss`` gives c = R / (gear Kt)^2 [W/(N m)^2]: the current is tau / (gear Kt), and its heat I^2 R.
   No source gives R and Kt of Unitree's motors, so that a number for them is an assumption.

@@ -13,8 +13,9 @@ from legged_torque.deploy.simulation import Simulation
 
 
 def test_constant_delays(make_task, tmp_path):
-    """Actions reach the motors 6 physics steps late, and measurements the policy 15 ms, in an export as in training."""
+    """Actions reach the motors 6 physics steps late, and steps of measurements the policy 15 ms, as in training."""
     changes = {"motors.delay.range": [6, 6], "sensing.delay.range": [15, 15], "sensing.delay.unit": "milliseconds"}
+    changes |= {"motors.chain": ["delay", "encoder", "ideal"], "motors.encoder.velocity_resolution": 0.25}
     export_random(make_task, "a1_torque", tmp_path / "out", **changes, **{"env.history_length": 2})
     policy = Policy(tmp_path / "out")
     latency = policy.description["latency"]
@@ -33,7 +34,7 @@ def test_constant_delays(make_task, tmp_path):
     simulation.run(10, seed=1)
     assert len(speeds) == 41  # of one episode: at its start, and after each physics step
     for number, velocities in enumerate(seen):
-        assert np.array_equal(velocities, speeds[max(4 * number - 3, 0)])
+        assert np.array_equal(velocities, 0.25 * np.round(np.float32(speeds[max(4 * number - 3, 0)]) / 0.25))
     scale = np.float32(policy.description["actions"]["terms"][0]["scale"])
     for t, applied in enumerate(torques):
         expected = scale * sent[(t - 6) // 4] if t >= 6 else np.zeros(12)

@@ -171,13 +171,24 @@ def test_lying_robots_against_mujoco(make_task):
     assert (touching.sum(axis=1) >= 4).all() and touching[:, 0].any()
 
 
-@pytest.mark.parametrize(("name", "torques"), [("a1_position", pd_by_hand), ("a1_torque", lambda a, q, qd: 8.0 * a)])
-def test_power_of_all_physics_steps(make_task, name, torques):
+FRICTION = {"motors.chain": ["delay", "ideal", "friction"], "motors.friction.viscous_friction": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("name", "torques", "motors", "viscous"),
+    [
+        ("a1_position", pd_by_hand, {}, 0.0),
+        ("a1_torque", lambda a, q, qd: 8.0 * a, {}, 0.0),
+        ("a1_torque", lambda a, q, qd: 8.0 * a, FRICTION, 0.3),
+    ],
+)
+def test_power_of_all_physics_steps(make_task, name, torques, motors, viscous):
     """Work and heat are those of a plain MuJoCo loop over the physics steps, in the kernel and with torques in torch.
 
+    Motors pay for their own friction, which joints do not get.
     Measured worlds go on as others do to the bit, which take one launch per control step.
     """
-    settings = {**CONVERGED, "control.copper_loss": COPPER, "env.episode_length_s": 1e3}
+    settings = {**CONVERGED, "control.copper_loss": COPPER, "env.episode_length_s": 1e3, **motors}
     plain, *measured = (make_task(name, 2, **settings) for _ in range(3))
     torques_in_torch(measured[1])
     walking = [WalkingMetrics(task) for task in measured]
@@ -191,10 +202,10 @@ def test_power_of_all_physics_steps(make_task, name, torques):
         for world in range(2):
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = (values[world] for values in before)
             for _ in range(4):
-                data.ctrl[:] = np.clip(torques(actions[world], data.qpos[7:], data.qvel[6:]), -33.5, 33.5)
+                made = np.clip(torques(actions[world], data.qpos[7:], data.qvel[6:]), -33.5, 33.5)
+                data.ctrl[:] = made - viscous * data.qvel[6:]
                 mujoco.mj_step(plain.sim.mj_model, data)
-                heat = COPPER_OF_JOINTS @ data.ctrl**2
-                expected[:, world] += np.abs(data.ctrl * data.qvel[6:]).sum() / 4, heat / 4
+                expected[:, world] += np.abs(made * data.qvel[6:]).sum() / 4, COPPER_OF_JOINTS @ made**2 / 4
         assert all(torch.equal(getattr(plain.sim, part), getattr(measured[0].sim, part)) for part in STATE)
         for part in STATE:
             getattr(measured[1].sim, part).copy_(getattr(plain.sim, part))  # rounding errors do not add up

@@ -43,7 +43,7 @@ def copies(tensors):
 def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
     """Losses are finite, every parameter is learned, and the run's folder holds the checkpoint and the curves."""
     warmup = {"pretraining.critic_warmup_iterations": 0}
-    length = 3 * (0.005 if name.endswith("two_rates") else 0.02)  # three control steps
+    length = 3 * (0.005 if name.endswith(("two_rates", "sata")) else 0.02)  # three control steps
     runner = make_runner(name, log_root=tmp_path, env={"env.episode_length_s": length}, **warmup)
     before = copies(networks(runner))
     runner.learn(2, init_at_random_ep_len=True)

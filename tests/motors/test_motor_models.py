@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.settings import error_of
+from support.control import NOMINAL, pd_by_hand
+from support.episodes import HIGH_UP
+from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.asset import load_asset
 from legged_torque.motors import models
 from legged_torque.motors.joints import Joints
 from legged_torque.motors.model_config import MODELS
@@ -28,6 +31,7 @@ CONSTANTS = {
     | {"load_friction": 0.05, "activation_speed": 0.5},
     "thermal": {"continuous_torque": {"hip": 5.0, "thigh": 12.0, "calf": 40.0}, "time_constant": 0.02},
     "quantize": {"resolution": {"hip": 0.5, "thigh": 0.01, "calf": 3.0}},
+    "muscle": {"growth": {"hip": 0.3, "thigh": 1.0, "calf": 0.7}},
 }
 
 
@@ -45,6 +49,10 @@ def by_hand(model, wanted, pos, vel):
     for step, (asked, speed) in enumerate(zip(wanted, vel, strict=True)):
         if model == "lag":
             state = torques[step] = asked + np.exp(-DT / np.array([1e-9, 0.002, 0.02])) * (state - asked)
+        elif model == "muscle":
+            limit = PEAK * np.array([0.3, 1.0, 0.7])
+            state = 0.4 * state + 0.6 * np.tanh(asked / limit)
+            torques[step] = limit * (state - np.abs(state) * speed / 21.0)
         elif model == "thermal":
             rated, decay = np.array([5.0, 12.0, 40.0]), np.exp(-DT / 0.02)
             most = [np.interp(np.sqrt(state[:, j]), [0.8 * r, r], [max(PEAK, r), r]) for j, r in enumerate(rated)]
@@ -97,6 +105,7 @@ def evaluate_all(
     friction: models.Friction,
     thermal: models.Thermal,
     quantize: models.Quantize,
+    muscle: models.Muscle,
     wanted: wp.array2d[float],
     pos: wp.array2d[float],
     vel: wp.array2d[float],
@@ -112,6 +121,7 @@ def evaluate_all(
     torques[3, i, j] = models.friction_torque(friction, i, j, 0, tau, q, qd)
     torques[4, i, j] = models.derated_torque(thermal, i, j, 0, tau, q, qd)
     torques[5, i, j] = models.quantized_torque(quantize, i, j, 0, tau, q, qd)
+    torques[6, i, j] = models.muscle_torque(muscle, i, j, 0, tau, q, qd)
 
 
 def draw(*shape):
@@ -131,7 +141,7 @@ def computed():
     in_torch, in_kernel = (
         {model: settings(model, **own).build(joints()) for model, own in CONSTANTS.items()} for _ in range(2)
     )
-    reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(6, WORLDS, 3)
+    reads, out = [link.kernel_reads() for link in in_kernel.values()], torch.zeros(7, WORLDS, 3)
     twins = {model: [twin_of(model, own) for _ in range(WORLDS)] for model, own in CONSTANTS.items()}
     for step in range(STEPS):
         inputs = [torch.tensor(values[step]) for values in (wanted, pos, vel)]
@@ -177,23 +187,62 @@ def test_as_mujoco_s_dc_motor():
         assert twin.apply(np.full(3, 100.0), POSE, np.full(3, speed)) == pytest.approx(data.actuator_force[0], abs=1e-5)
 
 
-def test_energy_of_the_drive():
-    """What damping on the drive takes from a turning body is what the body loses, step by step, as MuJoCo counts it."""
-    model = mujoco.MjModel.from_xml_string(
+@pytest.mark.parametrize(
+    ("model", "constants", "made"),
+    [("drive", {"damping": 0.05}, 0.0), ("friction", {"viscous_friction": 0.03, "static_friction": 0.2}, 0.1)],
+)
+def test_energy_balance(model, constants, made):
+    """What the drive's damping and friction take from a turning body is what it loses, step by step, as MuJoCo counts.
+
+    A motor with friction is counted as making what was asked of it.
+    """
+    body = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0"><flag energy="enable"/></option><worldbody><body>'
         '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'
         '<actuator><motor joint="joint"/></actuator></mujoco>'
     )
-    data, twin, lost = mujoco.MjData(model), twin_of("drive", {"damping": 0.05}), 0.0
+    data, twin, lost, work = mujoco.MjData(body), twin_of(model, constants), 0.0, 0.0
     data.qvel = 12.0
-    mujoco.mj_forward(model, data)
+    mujoco.mj_forward(body, data)
     start = data.energy[1]
     for _ in range(200):
-        data.ctrl, before = twin.apply(np.zeros(3), POSE, np.full(3, data.qvel[0]))[0], data.qvel[0]
-        mujoco.mj_step(model, data)
-        lost += 0.05 * before * (before + data.qvel[0]) / 2.0 * 0.002
-    mujoco.mj_forward(model, data)
-    assert start - data.energy[1] == pytest.approx(lost, rel=1e-6) and data.energy[1] < 0.1 * start
+        data.ctrl, before = twin.apply(np.full(3, made), POSE, np.full(3, data.qvel[0]))[0], data.qvel[0]
+        motor = twin.before_friction(data.ctrl)[0] if model == "friction" else 0.0
+        mujoco.mj_step(body, data)
+        moved = (before + data.qvel[0]) / 2.0 * 0.002
+        friction = 0.05 * before if model == "drive" else 0.2 * np.exp(-((before / 0.1) ** 2)) + 0.03 * before
+        lost, work = lost + friction * moved, work + motor * moved
+    mujoco.mj_forward(body, data)
+    assert start + work - data.energy[1] == pytest.approx(lost, rel=1e-6) and lost > 0.5 * start
+    assert work == pytest.approx(made * data.qpos[0], rel=0.01, abs=1e-9)
+
+
+@pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
+def test_encoder(make_task, in_torch):
+    """PD law, drive and policy have steps of position and speed; friction, behind the encoder, and critic true ones."""
+    steps = {"motors.encoder.position_resolution": 0.05, "motors.encoder.velocity_resolution": {"hip": 0.5, "joint": 2}}
+    chain = {"motors.chain": ["delay", "drive", "encoder", "friction"], "motors.drive.damping": 0.3}
+    settings = {"motors.friction.viscous_friction": 0.1, "control.decimation": 1, **HIGH_UP, **steps, **chain}
+    task = make_task("a1_position", 20, **settings)
+    if in_torch:
+        torques_in_torch(task)
+    twin = MotorTwin(described(task.motors.describe(), NOMINAL, task.dof_names))
+    step = np.array([0.5, 2.0, 2.0] * 4, np.float32)
+    for _ in range(3):
+        q, qd = task.dof_pos.numpy().copy(), task.dof_vel.numpy().copy()
+        seen, seen_qd = np.round(q / np.float32(0.05)) * np.float32(0.05), np.round(qd / step) * step
+        obs = task.get_observations()
+        np.testing.assert_allclose(obs["policy"][:, 9:21], seen - NOMINAL, atol=1e-6)
+        np.testing.assert_allclose(obs["policy"][:, 21:33], 0.05 * seen_qd, atol=1e-6)
+        np.testing.assert_allclose(obs["critic"][:, 21:33], 0.05 * qd, atol=1e-6)
+        actions = np.random.default_rng(0).normal(size=(20, 12))
+        task.step(torch.tensor(actions, dtype=torch.float32))
+        wanted = pd_by_hand(actions, seen, seen_qd)
+        expected = wanted - 0.3 * seen_qd - 0.1 * qd
+        np.testing.assert_allclose(task.torques, expected, rtol=1e-6, atol=2e-5)
+        np.testing.assert_allclose(twin.apply(wanted[0], q[0], qd[0]), expected[0], rtol=1e-6, atol=2e-5)
+        np.testing.assert_allclose(twin.measured(q[0], qd[0]), [seen[0], seen_qd[0]], rtol=1e-6)
+    assert "one encoder" in error_of(MotorTwin, described({"a": {"model": "encoder"}, "b": {"model": "encoder"}}))
 
 
 def test_draws_and_resets():
@@ -236,14 +285,31 @@ def test_choices(task, choice, joint, speed, most):
     assert torques[list(pose).index(joint)] == pytest.approx(most, rel=1e-6, abs=1e-6)
 
 
+def test_armature():
+    """With its own motors, joints of the G1 have the inertia of their rotors more; of other robots, the file's."""
+    inertia = {}
+    for choice in ("ideal", "real"):
+        model = load_asset(task_registry.get_cfgs("g1_position", Options(device="cpu", motors=choice))[0]).mj_model
+        data, full = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, full)
+        inertia[choice] = np.diag(full)[6:] - (0.01 if choice == "ideal" else 0.0)
+    rotors = 2 * [0.01018, 0.0251, 0.01018, 0.0251, 2 * 0.00361, 2 * 0.00361]
+    np.testing.assert_allclose(inertia["real"] - inertia["ideal"], rotors, atol=1e-9)
+    cfg = task_registry.get_cfgs("go2_torque", Options(device="cpu", motors="real"))[0]
+    assert cfg.motors.armature(list(cfg.init_state.default_joint_angles)) == {}
+
+
 @pytest.mark.parametrize(
     ("model", "constants", "words"),
     [
         ("curve", {"knee_speed": 31.0, "no_load_speed": 30.0}, ["motors.own.knee_speed", "30", "31", "'hip'"]),
         ("curve", {"braking_torque": -1.0}, ["motors.own.braking_torque", "at least 0", "-1"]),
+        ("curve", {"armature": {"hip": -1.0}}, ["motors.own.armature", "-1"]),
         ("drive", {"damping": {"hip": 1.0}}, ["motors.own.damping", "thigh"]),
         ("lag", {"time_constnt": 0.1}, ["time_constant"]),
         ("friction", {"activation_speed": 0.0}, ["motors.own.activation_speed", "greater than 0"]),
+        ("encoder", {"velocity_resolution": {"h": 1.0, "calf": 0.0}}, ["motors.own.velocity_resolution", "greater"]),
         ("thermal", {"draws": {"continous_torque": {"scale": [0.9, 1.1]}}}, ["did you mean 'continuous_torque'"]),
     ],
 )

@@ -245,6 +245,36 @@ def test_mistakes():
     assert "links that act on actions first" in error_of(make, 1, ("curve", "delay"))
 
 
+def test_sata(make_task):
+    """Limits and the rate of new actions grow by Gompertz' curve; fatigue is observed, penalized and forgotten."""
+    task = make_task("a1_sata", 3, **{"motors.delay.loss": 0.0, **HIGH_UP})
+    for age, rate in ((0, 0.5), (24_000 * 4096, 0.5 + 0.5 * np.exp(-1.0)), (10**10, 1.0)):
+        task.total_steps.fill_(age)
+        task.update_curriculum()
+        task.reset()
+        act, fatigue, sent = np.zeros((3, 12)), np.zeros((3, 12)), np.zeros((3, 12))
+        limit = 33.5 * (0.3 + 0.7 * np.exp(-np.exp(-3e-5 * (age / 4096 - 24_000))))
+        for step in range(9):
+            if step == 5:
+                time_out(task, [1])
+            drawn, qd = 6.0 * np.random.default_rng(step).normal(size=(3, 12)), task.dof_vel.numpy().copy()
+            number = task.episode_length_buf.numpy().copy()
+            task.step(torch.tensor(drawn, dtype=torch.float32))
+            is_due = np.floor(rate * number + 1e-5) > np.floor(rate * (number - 1) + 1e-5)
+            sent = np.where(is_due[:, None], drawn, sent)
+            act = 0.4 * act + 0.6 * np.tanh(5.0 * sent / limit)
+            torques = limit * (act - np.abs(act) * qd / 21.0)
+            fatigue = 0.9 * (fatigue + 0.005 * np.abs(torques))
+            kept = ~task.reset_buf.numpy()
+            assert kept.tolist() == [True, step != 5, True]
+            np.testing.assert_allclose(task.torques[kept], np.clip(torques, -33.5, 33.5)[kept], rtol=1e-3, atol=1e-3)
+            act[~kept] = fatigue[~kept] = sent[~kept] = 0.0
+            np.testing.assert_allclose(task.observations.by_term()["fatigue"], fatigue, rtol=1e-3, atol=1e-4)
+            wanted = (fatigue * np.abs(5.0 * sent)).sum(axis=1)
+            np.testing.assert_allclose(task._reward_fatigue(), wanted, rtol=1e-3, atol=1e-3)
+    assert "one muscle" in error_of(make_task, "a1_sata", 1, **{"motors.chain": ["delay", "ideal"]})
+
+
 @pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
 def test_torque_perturbation(make_task, in_torch):
     """Each joint gets 2 tanh(offset + of_pos q + of_vel qd) [N m] more, by weights that an episode draws."""

@@ -47,7 +47,8 @@ class VariableStiffnessRobot(LeggedRobot):
         p_gains = self.p_gains + settings.stiffness_scale * changes @ self._means
         p_gains = p_gains.clamp(*settings.stiffness_range)
         targets = self.default_dof_pos + control.joint_offset + control.action_scale * targets
-        return p_gains * (targets - self.dof_pos) - self.d_gains * p_gains.sqrt() * self.dof_vel
+        pos, vel = self.motors.measured(self.dof_pos, self.dof_vel)
+        return p_gains * (targets - pos) - self.d_gains * p_gains.sqrt() * vel
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the usual ones; in a mirror image, stiffness actions keep their signs."""

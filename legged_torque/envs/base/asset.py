@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -87,6 +88,9 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
         problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
     use_plain_motors(spec, model)
+    motors: Any = cfg.motors
+    for name, armature in motors.armature(dof_names).items():
+        spec.joint(name).armature = armature
     _choose_self_collisions(settings, spec, model, notes)
     with loading(file):
         model = spec.compile()

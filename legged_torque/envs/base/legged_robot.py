@@ -127,10 +127,11 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """Return the torques that motors are asked for [N m], at every physics step: those of :meth:`action_terms`.
 
-        Override it to compute them in torch; the physics kernel does not compute them then. Shapes: (num_envs,
-        num_actions) to (num_envs, num_dof).
+        Override it to compute them in torch; the physics kernel does not compute them then. Joint encoders tell
+        ``motors.measured``. Shapes: (num_envs, num_actions) to (num_envs, num_dof).
         """
-        return self.control_law.torques(actions, self.dof_pos, self.dof_vel, out=self._wanted_torques)
+        measured = self.motors.measured(self.dof_pos, self.dof_vel)
+        return self.control_law.torques(actions, *measured, out=self._wanted_torques)
 
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the terms of all groups of observations."""
@@ -332,20 +333,20 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         cfg.env.num_actions = self.num_actions
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
         self._use_attributes_of(self.state)
-        self.power = PowerMeter(self.state, cfg.control, self.dof_names)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)
         constants = (self.dof_names, self.torque_limits, armature)
         self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, self.default_dof_pos))
         self.motor_strength = self.motors.strength
+        self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
         self._torque_kernel = None
         if "torques_in_kernel" in self.sim.capabilities and cfg.control.refresh_torques:
             law = self.control_law.kernel
             self._torque_kernel = self.motors.kernel(law) if law else None
             if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
-        self.sensors = Sensors(cfg, self.state)
+        self.sensors = Sensors(cfg, self.state, self.motors)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""

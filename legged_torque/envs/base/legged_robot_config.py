@@ -11,7 +11,7 @@ from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.presets import standard_presets
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
-from legged_torque.motors.config import DelayCfg, IdealCfg, LatencyCfg, PerturbationCfg
+from legged_torque.motors.config import DelayCfg, LatencyCfg, PerturbationCfg
 from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.limits import (
@@ -100,9 +100,6 @@ class LeggedRobotCfg(BaseConfig):
             offset = 1.0  # the largest weights, either way: of a constant,
             of_pos = 1.0  # [1/rad] of the joint position,
             of_vel = 0.1  # [s/rad] and of the joint velocity
-
-        class ideal(IdealCfg):  # any torque within the limits, at once
-            pass
 
     class sensing:  # from the robot's own sensors, joint encoders and IMU, to the policy
         class delay(LatencyCfg):  # of the measurement of each physics step; the critic sees the present

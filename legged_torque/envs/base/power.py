@@ -6,6 +6,7 @@ import torch
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
+from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.config import by_joint
 
 
@@ -14,7 +15,7 @@ class PowerMeter:
 
     In a physics step a torque is constant, and MuJoCo turns the joint by its new velocity times the step: the work is
     torque times new velocity times the step. Braking counts as driving, since nothing says that a battery takes it.
-    Torques are those that joints get: what a ``friction`` link takes from the motors is not counted.
+    Torques are those of the motors: what friction in a model of motors takes from them has been paid for, too.
 
     Attributes:
         is_on: Whether steps are measured; trainings do without. See :meth:`BaseTask.measure_power`.
@@ -26,9 +27,11 @@ class PowerMeter:
 
     is_on = False
 
-    def __init__(self, state: RobotState, control: type[LeggedRobotCfg.control], dof_names: Sequence[str]) -> None:
+    def __init__(
+        self, state: RobotState, motors: MotorChain, control: type[LeggedRobotCfg.control], dof_names: Sequence[str]
+    ) -> None:
         """Take decimation and losses of the section ``control``; errors of :func:`by_joint`."""
-        self._state, self._share = state, 1.0 / control.decimation
+        self._state, self._motors, self._share = state, motors, 1.0 / control.decimation
         losses = by_joint("control.copper_loss", control.copper_loss, dof_names)
         self.copper_loss, self.has_losses = torch.tensor(losses, device=state.device), any(losses)
         self.mechanical = torch.full((state.num_envs,), torch.nan, device=state.device)
@@ -44,7 +47,7 @@ class PowerMeter:
 
     def _add_step(self) -> None:
         """Add the physics step that has just been made."""
-        torques, vel = self._state.torques, self._state.dof_vel
+        torques, vel = self._motors.before_friction(self._state.torques), self._state.dof_vel
         self.mechanical.add_((torques * vel).abs().sum(dim=1), alpha=self._share)
         if self.has_losses:
             self.copper.add_(torques.square() @ self.copper_loss, alpha=self._share)

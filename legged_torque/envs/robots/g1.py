@@ -40,6 +40,7 @@ class G1Cfg(LeggedRobotCfg):
             no_load_speed = {"hip_roll": 22.7, "knee": 22.7, "hip": 35.52, "ankle": 40.13}
             driving_torque = {"hip_roll": 111.0, "knee": 111.0, "hip": 71.0, "ankle": 2 * 24.8}
             braking_torque = {"hip_roll": 131.0, "knee": 131.0, "hip": 83.3, "ankle": 2 * 31.9}
+            armature = {"hip_roll": 0.0251, "knee": 0.0251, "hip": 0.01018, "ankle": 2 * 0.00361}
             draws = ASSUMED_VOLTAGE
 
         class friction:
