@@ -1,5 +1,7 @@
 """Settings of multi-head control, see :mod:`~legged_torque.envs.approaches.multi_head`."""
 
+from typing import Any
+
 from legged_torque.envs.approaches.fast_config import FastCfg, FastCfgPPO
 from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg
 from legged_torque.envs.base.clocks import whole_steps

@@ -28,7 +28,7 @@ class SataCfg(FastCfg, TorqueCfg):
         torque_scale = 5.0
 
         class growth(Section):  # the way to a grown robot: exp(-exp(-k (t - t_mid))), t in total steps
-            k: NotNegative = 3e-5 / 4096  # [1/total steps]; the authors' numbers for 4096 worlds, as is
+            k: NotNegative = 3e-5 / 4096  # [1/total steps]; both for 4096 worlds, unconfirmed by the authors
             t_mid: NotNegative = 24_000.0 * 4096  # [total steps]
             torque: Fraction = 0.3  # share of the torque limits at first
             rate: Fraction = 0.5  # share of control steps with new actions at first
