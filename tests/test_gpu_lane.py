@@ -1,12 +1,8 @@
 """The tests that need a GPU have passed with this code: the record of their last run, and its fingerprint."""
 
 import json
-from types import SimpleNamespace
 
-import pytest
-import torch
-from support import last_run
-from support.last_run import FILE, FOLDER, PACKAGES, TESTED, Recorder, fingerprint
+from support.last_run import FILE, FOLDER, TESTED, fingerprint
 
 ADVICE = "run 'python -m pytest -q -n 10 --dist loadfile tests/gpu' on a GPU, or give a reason in "
 ADVICE += 'tests/gpu/last_run.json: "stale": "<reason>"'
@@ -65,60 +61,3 @@ def test_fingerprint(tmp_path):
         assert fingerprint(package) != first
         (package / part / "new.py").unlink()
     assert all(list((FOLDER.parents[1] / "legged_torque" / part).rglob("*.py")) for part in TESTED)
-
-
-def report(nodeid, when, outcome):
-    """A report of pytest about a part of a test."""
-    return SimpleNamespace(nodeid=nodeid, when=when, outcome=outcome, passed=outcome == "passed")
-
-
-@pytest.fixture
-def session(tmp_path, monkeypatch):
-    """A session of pytest on a GPU that ends in a moment, and the file that it would write."""
-    monkeypatch.setattr(last_run, "FILE", tmp_path / "last_run.json")
-    monkeypatch.delenv("GPU_TESTS_DEVICE", raising=False)
-    for name, value in {"is_available": True, "device_count": 1, "get_device_name": "H100"}.items():
-        monkeypatch.setattr(torch.cuda, name, lambda value=value: value)
-    config = SimpleNamespace(args=["tests/gpu"], option=SimpleNamespace(keyword="", markexpr=""))
-    recorder = Recorder(config)
-    for file in FOLDER.glob("test_*.py"):
-        recorder.pytest_runtest_logreport(report(f"tests/gpu/{file.name}::test_x", "call", "passed"))
-    return recorder, config, tmp_path / "last_run.json"
-
-
-def finish(recorder, **more):
-    """End the session."""
-    recorder.pytest_sessionfinish(**{"session": SimpleNamespace(shouldfail=False), "exitstatus": 0} | more)
-
-
-def test_a_whole_run_is_kept(session):
-    """With its numbers, versions and fingerprint; tests elsewhere do not count, and each counts once."""
-    recorder, _, file = session
-    step = "tests/gpu/test_gpu_step.py"
-    for nodeid, when, outcome in (
-        (f"{step}::test_y", "call", "failed"),
-        (f"{step}::test_y", "teardown", "passed"),
-        (f"{step}::test_z", "setup", "skipped"),
-        (f"{step}::test_z", "teardown", "passed"),
-        ("tests/test_house.py::test_y", "call", "failed"),
-    ):
-        recorder.pytest_runtest_logreport(report(nodeid, when, outcome))
-    finish(recorder, exitstatus=1)
-    run = json.loads(file.read_text())
-    assert (run["passed"], run["failed"], run["skipped"]) == (len(list(FOLDER.glob("test_*.py"))), 1, 1)
-    assert run["device"] == "1 x H100" and run["fingerprint"] == fingerprint() and run["torch"] == torch.__version__
-    assert {"date", "seconds", *PACKAGES} <= run.keys()
-
-
-@pytest.mark.parametrize("what", ["some tests", "a file less", "the CPU"])
-def test_a_partial_run_is_not_kept(session, monkeypatch, what):
-    """Nothing is written."""
-    recorder, config, file = session
-    if what == "some tests":
-        config.args.append("tests/gpu/test_gpu_step.py::test_x")
-    elif what == "a file less":
-        recorder._outcomes.popitem()
-    else:
-        monkeypatch.setenv("GPU_TESTS_DEVICE", "cpu")
-    finish(recorder)
-    assert not file.exists()

@@ -29,9 +29,6 @@ def random_state(seed, height=0.3):
     return np.array([0.0, 0.0, height]), quaternion(*rng.uniform(-0.3, 0.3, 3)), q, velocities
 
 
-# --------------------------------------------------------------------------------------------------- independence
-
-
 def test_imports_neither_torch_nor_warp():
     """What runs on a robot needs none of the packages of training."""
     modules = [*(f"deploy.{name}" for name in ("description", "ground", "policy", "robot", "simulation"))]
@@ -41,9 +38,6 @@ def test_imports_neither_torch_nor_warp():
     code += " or name.removeprefix('legged_torque.').split('.')[0] in ('envs', 'checks', 'learning', 'sim')])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=XML.parents[3])
     assert (result.stdout.strip(), result.stderr) == ("[]", "")
-
-
-# --------------------------------------------------------------------------------------------------- the robot
 
 
 def test_physics_is_the_task_s(make_task, policy):
@@ -69,9 +63,6 @@ def test_physics_is_the_task_s(make_task, policy):
             assert robot.contact_force() == pytest.approx(force, rel=0.02, abs=1.0)
             on_ground += force > 20.0
     assert on_ground > 5
-
-
-# --------------------------------------------------------------------------------------------------- metrics, events
 
 
 def test_velocity_in_the_frame_of_the_trunk(policy):
@@ -197,9 +188,6 @@ def test_episodes_end(policy):
     simulation._steps = 1000
     assert simulation._finish_step(simulation.command).tolist() == [0.0] * 11
     assert simulation._steps == 0
-
-
-# --------------------------------------------------------------------------------------------------- the script
 
 
 def test_script(exported, tmp_path):

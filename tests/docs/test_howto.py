@@ -26,6 +26,7 @@ PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
 """Pages whose Python is run: that of docs/terrain.md in tests/terrain/test_terrain.py, all else here."""
 TINY = ["--device=cpu", "--num_envs=2", "--max_iterations=2", "--set=runner.num_steps_per_env=4"]
+TINY += ["--set=control.refresh_torques=false"]  # with the kernel that others have compiled
 """Options that make the trainings of a page short."""
 YOURS = "yours"
 """Word in the mark of a block whose tasks and files a reader has made."""

@@ -32,8 +32,7 @@ def make_jointed():
     return mujoco.MjSpec.from_string(JOINTED)
 
 
-ROBOTS = {"walker": (make_walker, "fused"), "walker_slow": (make_walker, "mujoco_warp")}
-ROBOTS["jointed"] = (make_jointed, "mujoco_warp")
+ROBOTS = {"walker": (make_walker, "fused"), "jointed": (make_jointed, "mujoco_warp")}
 FEET = {"walker": (["Lfoot", "Rshin", "Rfoot"], [0, 1, 2]), "jointed": (["upper", "palm", "thumb"], [0, 1, 1])}
 """Geoms that stand for feet, and the foot of each."""
 LONGER = (0.1, 0.2, 0.3)
@@ -45,12 +44,12 @@ def moving(request):
     """A simulator after a step, the state of its robots, and for each world MuJoCo's data before and after it."""
     make, engine = ROBOTS[request.param]
     model = compiled(make())
-    geoms, foot_of = FEET[request.param.removesuffix("_slow")]
+    geoms, foot_of = FEET[request.param]
     states, sim = draw_states(model, 5, (0.1, 0.2)), make_engine(engine, model, 5, "cpu", 100, 50)
     places = [[model.geom(ref).name for ref in model.sensor_refid].index(name) for name in geoms]
     state = RobotState(sim, None, places, foot_of, 1, 0.02)
     longer = np.zeros((5, 3))
-    if make is make_walker:  # parameters per world need one hinge per body
+    if engine == "fused":  # parameters per world need one hinge per body
         longer[3] = LONGER
         sim.field("body_pos")[:, -1] += torch.tensor(longer)
     put(sim, states)

@@ -31,9 +31,6 @@ def to_steps(task, total_steps):
     task.update_curriculum()
 
 
-# ------------------------------------------------------------------------------------- curriculum with multi-head
-
-
 def test_curriculum_with_multi_head(make_task):
     """Torques are eq. 7 with a PD part that fades to 0; rewards have the nominal pose's, with its own weights."""
     task = make_task(CURRICULUM, 3)
@@ -49,9 +46,6 @@ def test_curriculum_with_multi_head(make_task):
         assert task.reward_weights()[place].item() == pytest.approx(0.02 * weight)
     tracking = task.cfg.rewards.curriculum.tracking_lin_vel
     assert (tracking.t_start, tracking.t_end) == (3_000_000, 13_000_000)
-
-
-# ------------------------------------------------------------------------------------------- gravity with the others
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
@@ -97,9 +91,6 @@ def test_tasks_that_cannot_give_torques(make_task):
         check_torques(make_task(name, 1))
 
 
-# ---------------------------------------------------------------------------------------------------- the higher pose
-
-
 def test_higher_pose(make_task):
     """In MuJoCo's kinematics its feet touch the ground at 0.33 m, below the same places as in the lower pose."""
     task, low = make_task(HIGH, 1), make_task("a1_torque_curriculum", 1)
@@ -119,9 +110,6 @@ def test_higher_pose(make_task):
     error = np.square(task.default_dof_pos.numpy() - NOMINAL).sum()
     task.dof_pos.copy_(low.default_dof_pos)
     assert task._reward_nominal_position().item() == pytest.approx(math.exp(-0.5 * error), rel=1e-4)
-
-
-# ---------------------------------------------------------------------------------------------------------- two rates
 
 
 def held(sent):

@@ -101,9 +101,6 @@ def task(make_task):
     return task
 
 
-# --------------------------------------------------------------------------------------------------- terms
-
-
 @pytest.mark.parametrize("term", CASES)
 def test_term_by_hand(task, term):
     """A term has its by-hand value in the world that was put into its state, and its neutral value in the others."""
@@ -147,9 +144,6 @@ def test_temperatures(make_task):
         neutral(task)
         construct(task, 0, term)
         assert getattr(task, f"_reward_{term}")().item() == pytest.approx(math.exp(expected), rel=1e-5)
-
-
-# --------------------------------------------------------------------------------------------------- weights and sum
 
 
 @pytest.mark.parametrize("decimation", [4, 2])

@@ -17,9 +17,6 @@ from legged_torque.utils.mirroring import SCALAR
 LEGS = ("FR", "FL", "RR", "RL")
 
 
-# ------------------------------------------------------------------------------------------------ robots
-
-
 def test_gains_by_joint():
     """Numbers go by a part of the joints' names; joints without one and names without a joint are refused."""
     names = [f"{leg}_{part}_joint" for leg in LEGS for part in ("hip", "calf")]
@@ -46,9 +43,6 @@ def test_robot_without_mirrored_legs(make_task):
     task = make_task("a1_torque", 1, **settings, **{"rewards.scales.symmetry": 0.0})
     task.step(torch.zeros(1, 12))
     assert "'FR_hip_joint' has no counterpart" in error_of(lambda: task.mirror)
-
-
-# ------------------------------------------------------------------------------------------------ terms and parameters
 
 
 @pytest.mark.parametrize(
@@ -93,9 +87,6 @@ def test_parameters_that_do_not_fit(make, message):
     cfg = A1Cfg()
     cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
     assert message in error_of(lambda: Robot(cfg).mirror)
-
-
-# ------------------------------------------------------------------------------------------------ ground
 
 
 class Raised(Plane):

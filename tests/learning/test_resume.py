@@ -59,6 +59,7 @@ OTHERS = {
     "rough": ["--task=a1_rough_torque_multihead_scan", "--set=terrain.num_rows=3"],
 }
 OTHERS["rough"] += ["--set=terrain.max_init_terrain_level=2", "--set=terrain.border_size=1"]
+OTHERS["rough"] += ["--set=control.refresh_torques=false"]  # with the kernel that others have compiled
 
 
 @pytest.mark.parametrize("name", OTHERS)

@@ -16,8 +16,6 @@ from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation
 from legged_torque.paper.report.evaluations import CURVE_METRICS
 
-# ------------------------------------------------------------------------------------------------- results
-
 
 @pytest.fixture
 def results(trained, tmp_path):
@@ -88,9 +86,6 @@ def test_curves_that_are_none(tmp_path, content):
     result = run_here("plot.py", "curves", "theirs.csv.gz", "--out=figure.png", root=tmp_path)
     assert_told_in_one_line(result, "" if not content else "'theirs.csv.gz'")
     assert not (tmp_path / "figure.png").exists()
-
-
-# ------------------------------------------------------------------------------------------------- exports
 
 
 @pytest.fixture(scope="module")

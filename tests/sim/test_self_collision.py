@@ -148,9 +148,6 @@ def test_too_many_contacts_are_reported():
         assert said is None if warning is None else warning in said
 
 
-# ------------------------------------------------------------------------------------------------------ the option
-
-
 def settings_of(file, on):
     """Settings of a task with this robot."""
     cfg = LeggedRobotCfg()

@@ -14,8 +14,6 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 
-# --------------------------------------------------------------------------------------------------- the surface
-
 
 @wp.kernel(enable_backward=False)
 def touch_all(
@@ -86,9 +84,6 @@ def test_triangles_of_a_plane_are_one_plane(slope):
     touching = touch["count"] == 1
     np.testing.assert_allclose(touch["dist"][touching, 0], dist[touching], rtol=0, atol=1e-6)
     np.testing.assert_allclose(touch["first"][touching], np.tile(normal, (touching.sum(), 1)), rtol=0, atol=2e-6)
-
-
-# ---------------------------------------------------------------------------------------------------
 
 
 def circle_point(radius, eighth):

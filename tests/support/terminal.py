@@ -36,4 +36,4 @@ def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables)
                 process.send_signal(signal.SIGINT)
                 after = ""
     os.close(master)
-    return process.wait(20), output.decode()
+    return process.wait(120), output.decode()

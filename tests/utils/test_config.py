@@ -58,8 +58,6 @@ def test_bad_overrides(item, message):
     assert message in error_of(get_cfgs, f"--set={item}")
 
 
-# ---- presets and precedence ------------------------------------------------------------------------------------------
-
 TABLE_II = {
     "algorithm.learning_rate": 1e-4,
     "algorithm.gamma": 0.99,
