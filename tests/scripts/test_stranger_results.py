@@ -99,33 +99,6 @@ def exported(trained, tmp_path_factory):
     return folder
 
 
-EXPORTS = {
-    "swapped terms": (lambda d: d["observations"]["terms"].reverse(), "was exported with other observations"),
-    "swapped joints": (lambda d: d["joint_order"].reverse(), "was exported with other joint_order"),
-    "huge speed": (lambda d: d["initial_state"].update(joint_velocity=[0.0, 1e30]), "initial_state.joint_velocity.1"),
-    "huge whole number": (lambda d: d["commands"].update(lin_vel_x=[0, 10**300]), "commands.lin_vel_x.1"),
-    "huger one": (lambda d: d["commands"].update(lin_vel_x=[0, 10**400]), "larger than settings are"),
-    "endless steps": (
-        lambda d: d["timing"].update(decimation=10**8, control_frequency=1e-6, physics_frequency=100.0),
-        "timing.decimation",
-    ),
-    "a class": (lambda d: d.update(task={"class_name": "payload:run"}), "task"),
-}
-
-
-@pytest.mark.parametrize("name", EXPORTS)
-def test_exports(exported, harm, tmp_path, name):
-    """What does not belong to the network, or to any robot, is refused by name."""
-    change, told = EXPORTS[name]
-    folder = shutil.copytree(exported, tmp_path / "out")
-    description = yaml.safe_load((folder / "policy.yaml").read_text())
-    change(description)
-    (folder / "policy.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
-    result = run_here("sim2sim.py", str(folder), "--steps=2", "--robots=1", root=tmp_path)
-    assert_told_in_one_line(result, told)
-    assert result[1] == ""
-
-
 def test_codes_of_terminals(exported, tmp_path):
     """What a description is called does not clear the screen."""
     folder = shutil.copytree(exported, tmp_path / "out")
