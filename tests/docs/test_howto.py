@@ -275,14 +275,6 @@ def test_python(run_page):
     assert 0.0 <= names["metrics"].means()["track_percentage"] <= 1.0
 
 
-def test_names_differ():
-    """No two pages name a file or a task alike, so that what a reader has copied stays."""
-    files = [name for page in sorted(RUN_PYTHON) for name, _ in python_files(page) if not name.startswith("block_")]
-    code = "".join(text for page in sorted(RUN_PYTHON) for _, text in python_files(page))
-    tasks = re.findall(r"register\(\s*\"(\w+)\"", code)
-    assert len(tasks) > 10 and len({*tasks}) == len(tasks) and len({*files}) == len(files)
-
-
 @pytest.mark.parametrize("page", PAGES)
 def test_marks(page):
     """Python that no test runs says so in the line above; tests that marks name are there."""

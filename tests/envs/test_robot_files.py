@@ -7,16 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.robot_files import (
-    A1,
-    EVEN_TRUNK,
-    joint,
-    servo,
-    setting,
-    shuffle_motors,
-    turn_left_hips,
-    unitree_order,
-)
+from support.robot_files import A1, EVEN_TRUNK, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
 from support.robot_files import changed as changed  # a fixture
 from support.scripts import run_here
 from support.settings import error_of

@@ -112,8 +112,7 @@ def test_a_ground_comes_without_touching_tasks(make_task, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("setting", "value", "nearest"),
-    [("motors.chain", ["idael"], "ideal"), ("terrain.mesh_type", "plan", "plane")],
+    ("setting", "value", "nearest"), [("motors.chain", ["idael"], "ideal"), ("terrain.mesh_type", "plan", "plane")]
 )
 def test_unknown_rooms(make_task, setting, value, nearest):
     """A name that does not exist is refused with the nearest one."""

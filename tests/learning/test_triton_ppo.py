@@ -7,15 +7,7 @@ import os
 
 import pytest
 import torch
-from support.rollouts import (
-    POISONS,
-    SIZES,
-    make_ppo,
-    parameters,
-    poison,
-    record_rollout,
-    steps_taken,
-)
+from support.rollouts import POISONS, SIZES, make_ppo, parameters, poison, record_rollout, steps_taken
 from support.runners import build_runner, networks
 from support.wide_ppo import assert_steps_are_those_of_torch, build, choose
 

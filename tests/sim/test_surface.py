@@ -93,8 +93,7 @@ def circle_point(radius, eighth):
 
 @pytest.mark.parametrize("ground", [stairs, pits, rough])
 @pytest.mark.parametrize(
-    ("kind", "size"),
-    [("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")],
+    ("kind", "size"), [("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")]
 )
 def test_nothing_falls_through(kind, size, ground):
     """What hits stairs, pits and rough ground at 5 m/s, straight or aslant, comes to lie on it and wins no energy."""
