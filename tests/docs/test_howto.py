@@ -276,15 +276,6 @@ def test_python(run_page):
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_marks(page):
-    """Python that no test runs says so in the line above; tests that marks name are there."""
-    for line, mark, language, block in fences(page):
-        assert language == "bash" or mark or page in RUN_PYTHON, f"{page}:{line}"
-        for test in re.findall(r"tests/\w+\.py", mark + block):
-            assert (ROOT / test).is_file(), f"{page}:{line}"
-
-
-@pytest.mark.parametrize("page", PAGES)
 def test_commands(page, tmp_path, monkeypatch):
     """Bash that is not marked is run, in its order, trainings with few worlds; so it calls nothing but scripts."""
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))

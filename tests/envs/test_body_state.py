@@ -7,29 +7,16 @@ import numpy as np
 import pytest
 import torch
 from support.fused import compiled, draw_states, make_walker, put
+from support.published import read_robot
 from support.settings import error_of
 
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.registry import make_engine
 
-JOINTED = """<mujoco><option timestep="0.004"/><default><motor ctrlrange="-9 9"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1"/>
-<body name="trunk" pos="0 0 1"><freejoint/><geom name="hull" size="0.1" mass="4"/>
- <body name="arm" pos="0.1 0 0.1" quat="1 0.3 0 0.1">
-  <joint name="lift" type="slide" axis="0.1 0 1" pos="0 0.1 0" ref="0.05"/>
-  <joint name="turn" axis="0 0.2 1" pos="0.02 0 0.1" ref="0.3"/>
-  <geom name="upper" size="0.06" mass="0.5"/>
-  <body name="mount" pos="0 0.1 0.2" quat="1 0 0.4 0"><geom name="mount" size="0.02" mass="0.1"/>
-   <body name="hand" pos="0 0.05 0"><joint name="bend" axis="1 0 0"/><joint name="reach" type="slide" axis="1 1 0"/>
-    <geom name="palm" size="0.03" pos="0.03 0 0" mass="0.2"/>
-    <geom name="thumb" size="0.02" pos="0 0.05 0.01" mass="0.1"/>
-</body></body></body></body></worldbody><sensor><framepos objtype="body" objname="mount"/></sensor>
-<actuator><motor joint="lift"/><motor joint="turn"/><motor joint="bend"/><motor joint="reach"/></actuator></mujoco>"""
-
 
 def make_jointed():
     """An arm with slides, several joints on a body, and reference angles; a body without joints is kept."""
-    return mujoco.MjSpec.from_string(JOINTED)
+    return read_robot("jointed")
 
 
 ROBOTS = {"walker": (make_walker, "fused"), "jointed": (make_jointed, "mujoco_warp")}

@@ -1,10 +1,9 @@
 """Robots, states and references for tests of engines."""
 
-from pathlib import Path
-
 import mujoco
 import numpy as np
 import torch
+from support.published import read_robot
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model
@@ -26,7 +25,7 @@ def make_a1(edit=None):
 
 def make_walker():
     """Two legs with four joints each, off their bodies' origins and about odd axes; one joint has no motor."""
-    return mujoco.MjSpec.from_file(str(Path(__file__).with_name("robots") / "walker.xml"))
+    return read_robot("walker")
 
 
 def make_crab():
@@ -34,7 +33,7 @@ def make_crab():
 
     Its settings differ from those of the fused step, but change no motion, and one geom passes through the floor.
     """
-    return mujoco.MjSpec.from_file(str(Path(__file__).with_name("robots") / "crab.xml"))
+    return read_robot("crab")
 
 
 ROBOTS = {"a1": make_a1, "walker": make_walker, "crab": make_crab}

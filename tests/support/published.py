@@ -1,6 +1,8 @@
-"""Robots as others publish them: a URDF, a plain MJCF and one in the manner of MuJoCo Menagerie."""
+"""Robots of tests, some as others publish them: a URDF, a plain MJCF and one in the manner of MuJoCo Menagerie."""
 
 from pathlib import Path
+
+import mujoco
 
 ROBOTS = Path(__file__).with_name("robots")
 
@@ -22,3 +24,8 @@ def as_menagerie():
     in another order than joints, damping for those servos, excluded contacts, a site, sensors, and a keyframe.
     """
     return (ROBOTS / "menagerie.xml").read_text()
+
+
+def read_robot(name):
+    """The specification of a robot of the tests."""
+    return mujoco.MjSpec.from_file(str(ROBOTS / f"{name}.xml"))
