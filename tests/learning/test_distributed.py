@@ -51,7 +51,7 @@ def make_runner(log_root, normalized=False):
         train_cfg.critic.obs_normalization = True
     set_seed(train_cfg.seed)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
-    runner, _ = task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=log_root)
     if log_root and distributed.rank() == 0:
         runner.claim_log_dir({"task": TASK, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     return runner
