@@ -26,7 +26,6 @@ PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not
 RUN_PYTHON = {"README.md", "docs/terrain.md"} | {page for page in PAGES if page.startswith("docs/howto/")}
 """Pages whose Python is run: that of docs/terrain.md in tests/terrain/test_terrain.py, all else here."""
 TINY = ["--device=cpu", "--num_envs=2", "--max_iterations=2", "--set=runner.num_steps_per_env=4"]
-TINY += ["--set=control.refresh_torques=false"]  # with the kernel that others have compiled
 """Options that make the trainings of a page short."""
 YOURS = "yours"
 """Word in the mark of a block whose tasks and files a reader has made."""
@@ -287,9 +286,12 @@ def test_commands(page, tmp_path, monkeypatch):
             lines = block.replace("\\\n", " ").strip().splitlines()
             assert len(calls) == len(lines), f"{page}:{line}"
             for script, words in calls:
+                changes = (
+                    [*TINY, "--set=control.refresh_torques=false"] if "motor" in page else TINY
+                )  # with a shared kernel
                 is_training = script == "train.py" and not {"--list", "--help"} & set(words)
                 if script:
-                    result = run_here(script, *words, *(TINY if is_training else []), root=tmp_path)
+                    result = run_here(script, *words, *(changes if is_training else []), root=tmp_path)
                 else:
                     result = command()
                 assert (result[0], result[2]) == (0, "") and result[1], [script, *words]

@@ -45,6 +45,7 @@ def cluster(stage):
     handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")  # which would write a token into the home folder
+        patch.setenv("RAY_TQDM_PATCH_PRINT", "0")  # which would stay in this process
         patch.setenv("PYTHONPATH", str(stage))
         head = {"num_cpus": 0, "include_dashboard": False, "_system_config": FAST}
         cluster = Cluster(initialize_head=True, head_node_args=head)
