@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.random_stream import upcoming
 from support.reproducible import differences, values
-from support.resume import WORLDS, content, start, train
+from support.resume import WORLDS, begin, content, start, train
 from support.settings import error_of
 
 from legged_torque.learning import checkpoint
@@ -217,8 +217,7 @@ def test_files_that_cannot_be_written(tmp_path, capsys):
         def add_scalar(self, *_):
             raise OSError(28, "No space left on device")
 
-    runner = start(tmp_path)
-    runner.claim_log_dir({})
+    runner = begin(tmp_path)
     folder = Path(runner.log_dir)
     runner.logger.init_logging_writer = lambda: setattr(runner.logger, "writer", Writer())
     (folder / "evaluations.csv").mkdir()
