@@ -36,18 +36,6 @@ def finish(process):
     return process.returncode, output, error
 
 
-def test_run_folder(root):
-    """A run leaves its checkpoints, events and settings, in a folder named by its time and name."""
-    (run,) = (root / "logs" / "a1_position").glob("*_good")
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d_good", run.name)
-    files = {path.name.split(".tfevents")[0] for path in run.iterdir() if path.is_file()}
-    models = {"model_0.pt", "model_1.pt", "model_2.pt"}  # the first so that the training can be watched at once
-    assert files == models | {"worlds_2.pt", "events.out", "config.yaml", "evaluations.csv"}
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    expected = {"task": "a1_position", "preset": "parallel", "device": "cpu", "max_iterations": 2}
-    assert expected.items() <= config.items() and config["env"]["env"]["num_envs"] == 2
-
-
 def test_resume_in_a_folder_by_its_path(root, tmp_path):
     """``--load_run`` takes a path, ``--checkpoint`` an earlier checkpoint, and other options still change settings.
 
