@@ -9,7 +9,7 @@ import signal
 import pytest
 import torch
 from support.runners import build_runner
-from support.scripts import assert_told_in_one_line, run_here
+from support.scripts import run_here
 
 from legged_torque.benchmark import measure as benchmark
 from legged_torque.envs import LeggedRobot, task_registry
@@ -119,17 +119,3 @@ def test_out_of_memory():
     assert is_out_of_memory(behind) and is_out_of_memory(MemoryError())
     assert not is_out_of_memory(RuntimeError("an illegal memory access was encountered"))
     assert not is_out_of_memory(ValueError("Failed to allocate"))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--rounds=0", "--rounds must be at least 1, not 0"),
-        ("--num_envs 2 4 --profile=trace.json", "--profile writes one trace: give one number of worlds"),
-    ],
-)
-def test_mistakes(tmp_path, words, message):
-    """Mistakes are refused in one line, before anything is measured."""
-    result = run_here("benchmark.py", *SMALL, *words.split(), root=tmp_path)
-    assert_told_in_one_line(result, message)
-    assert result[1] == "" and not list(tmp_path.iterdir())

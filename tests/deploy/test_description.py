@@ -16,6 +16,8 @@ from legged_torque.envs import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
 
 GROUND = dataclasses.asdict(Layout.of(LeggedRobotCfg.terrain()))
+LEGS = ("FR", "FL", "RR", "RL")
+ENDLESS = {"control_frequency": 1e-6, "physics_frequency": 100.0, "decimation": 10**8, "refresh_torques": True}
 DAMAGE = [
     ("format_version", 2, "format_version"),
     ("task", None, "'task' is a required property"),
@@ -32,6 +34,12 @@ DAMAGE = [
     ("network.sha256", 64 * "0", "is not the network that was exported with its policy.yaml"),
     ("timing.decimation", 4.0, "timing.decimation: 4.0 is not of type 'integer'"),
     ("timing.decimation", 5, "timing.physics_frequency is not control_frequency times decimation"),
+    ("joint_order", [f"{leg}_{part}_joint" for leg in LEGS for part in ("calf", "thigh", "hip")], "other joint_order"),
+    ("initial_state.joint_velocity", [0.0, 1e30], "initial_state.joint_velocity.1"),
+    ("commands.lin_vel_x", [0, 10**300], "commands.lin_vel_x.1"),
+    ("commands.lin_vel_x", [0, 10**400], "larger than settings are"),
+    ("timing", ENDLESS, "timing.decimation"),
+    ("task", {"class_name": "payload:run"}, "task"),
     ("terrain", GROUND | {"difficulty_range": [0.0, 1.5]}, "terrain.difficulty_range.1"),
 ]
 

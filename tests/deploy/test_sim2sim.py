@@ -29,9 +29,6 @@ def random_state(seed, height=0.3):
     return np.array([0.0, 0.0, height]), quaternion(*rng.uniform(-0.3, 0.3, 3)), q, velocities
 
 
-# --------------------------------------------------------------------------------------------------- independence
-
-
 def test_imports_neither_torch_nor_warp():
     """What runs on a robot needs none of the packages of training."""
     modules = [*(f"deploy.{name}" for name in ("description", "ground", "policy", "robot", "simulation"))]
@@ -41,9 +38,6 @@ def test_imports_neither_torch_nor_warp():
     code += " or name.removeprefix('legged_torque.').split('.')[0] in ('envs', 'checks', 'learning', 'sim')])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=XML.parents[3])
     assert (result.stdout.strip(), result.stderr) == ("[]", "")
-
-
-# --------------------------------------------------------------------------------------------------- the robot
 
 
 def test_physics_is_the_task_s(make_task, policy):
@@ -69,9 +63,6 @@ def test_physics_is_the_task_s(make_task, policy):
             assert robot.contact_force() == pytest.approx(force, rel=0.02, abs=1.0)
             on_ground += force > 20.0
     assert on_ground > 5
-
-
-# --------------------------------------------------------------------------------------------------- metrics, events
 
 
 def test_velocity_in_the_frame_of_the_trunk(policy):
@@ -199,11 +190,11 @@ def test_episodes_end(policy):
     assert simulation._steps == 0
 
 
-# --------------------------------------------------------------------------------------------------- the script
+def test_script(exported, tmp_path, monkeypatch):
+    """It prints the metrics with standard errors and writes them; any of the three paths names the policy.
 
-
-def test_script(exported, tmp_path):
-    """It prints the metrics with standard errors and writes them; any of the three paths names the policy."""
+    Mistakes are one line.
+    """
     words = ["--steps=20", "--robots=2", "--push_velocity=0.5", "--command", "0.5", "0", "-0.2"]
     outputs = []
     for path in (exported, exported / "policy.yaml", exported / "policy.onnx"):
@@ -217,25 +208,15 @@ def test_script(exported, tmp_path):
         mean, error = (float(number) for number in re.search(rf"{name} +(\S+) \+- (\S+)", output).groups())
         assert result["metrics"][name] == pytest.approx({"mean": mean, "standard_error": error}, abs=1e-4)
     assert (result["robots"], result["command"], result["task"]) == (2, [0.5, 0.0, -0.2], "a1_torque_multihead")
-
-
-MISTAKES = [
-    ("--steps=0", "--steps must be at least 1, not 0"),
-    ("--push_probability=0.1", "--push_probability needs --push_velocity"),
-    ("--push_velocity=1 --push_probability=2", "--push_probability must be from 0 to 1"),
-    ("--step=3", "unknown option '--step'; did you mean '--steps'?"),
-    ("--viewer", "MuJoCo's window needs a screen; --video works without one"),
-    ("--xml=nothing.xml", "cannot load the robot 'nothing.xml': there is no such file"),
-]
-
-
-@pytest.mark.parametrize(("words", "message"), MISTAKES)
-def test_mistakes(exported, tmp_path, monkeypatch, words, message):
-    """Exit status 2 and one line."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
-    result = run_here("sim2sim.py", str(exported), *words.split(), root=tmp_path)
-    assert_told_in_one_line(result, message)
+    for words, message in {
+        "--push_probability=0.1": "--push_probability needs --push_velocity",
+        "--push_velocity=1 --push_probability=2": "--push_probability must be from 0 to 1",
+        "--viewer": "MuJoCo's window needs a screen; --video works without one",
+        "--xml=nothing.xml": "cannot load the robot 'nothing.xml': there is no such file",
+    }.items():
+        assert_told_in_one_line(run_here("sim2sim.py", str(exported), *words.split(), root=tmp_path), message)
 
 
 def test_quaternion():

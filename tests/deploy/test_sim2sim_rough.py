@@ -55,9 +55,6 @@ def surface(policy):
     return HeightMap(layout.heights(), layout.horizontal_scale, layout.corner, "cpu")
 
 
-# --------------------------------------------------------------------------------------------------- the ground
-
-
 def test_ground_is_the_task_s(exported, policy, robot, surface):
     """``policy.yaml`` has the settings of the map; robots start where the task's do, on the task's surface."""
     task = exported[1]
@@ -175,9 +172,6 @@ def test_slope_is_a_tilted_plane():
     assert on_plane.qpos[0] > 0.2 and on_plane.ncon == 1
 
 
-# --------------------------------------------------------------------------------------------------- episodes
-
-
 def test_episodes_start_on_tiles(policy, robot):
     """Every robot has a tile for all of its episodes, any of them; one that leaves the map has fallen."""
     simulation, tiles, places = Simulation(policy, robot), [], []
@@ -199,9 +193,6 @@ def test_episodes_start_on_tiles(policy, robot):
     robot.position[0] = 10.1
     robot.step(np.zeros(12))
     assert robot.has_fallen() and math.isinf(robot.height())
-
-
-# --------------------------------------------------------------------------------------------------- other grounds
 
 
 def test_chosen_kinds(policy):
@@ -237,9 +228,6 @@ def test_ground_of_the_mjcf(policy, tmp_path):
     places = np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1], [9.0, 9.0]])
     np.testing.assert_allclose(robot.ground_heights(places), [0.0, 0.12, 0.0, 0.0], atol=1e-12)
     assert robot.origins.tolist() == [[0.0, 0.0, 0.0]]
-
-
-# --------------------------------------------------------------------------------------------------- mistakes
 
 
 def test_script(exported, tmp_path):

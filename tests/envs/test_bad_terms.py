@@ -133,9 +133,6 @@ def test_observation_that_divides_by_zero(make_dividing):
     assert not steps(task, 1)[0][3].any() and reported(task) == {}
 
 
-# ------------------------------------------------------------------------------------------ training
-
-
 @pytest.fixture
 def make_runner(make_task, make_dividing):
     """Factory of trainings of such tasks, in which no learning rate changes, and the task."""

@@ -7,33 +7,19 @@ import numpy as np
 import pytest
 import torch
 from support.fused import compiled, draw_states, make_walker, put
+from support.published import read_robot
 from support.settings import error_of
 
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sim.registry import make_engine
 
-JOINTED = """<mujoco><option timestep="0.004"/><default><motor ctrlrange="-9 9"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1"/>
-<body name="trunk" pos="0 0 1"><freejoint/><geom name="hull" size="0.1" mass="4"/>
- <body name="arm" pos="0.1 0 0.1" quat="1 0.3 0 0.1">
-  <joint name="lift" type="slide" axis="0.1 0 1" pos="0 0.1 0" ref="0.05"/>
-  <joint name="turn" axis="0 0.2 1" pos="0.02 0 0.1" ref="0.3"/>
-  <geom name="upper" size="0.06" mass="0.5"/>
-  <body name="mount" pos="0 0.1 0.2" quat="1 0 0.4 0"><geom name="mount" size="0.02" mass="0.1"/>
-   <body name="hand" pos="0 0.05 0"><joint name="bend" axis="1 0 0"/><joint name="reach" type="slide" axis="1 1 0"/>
-    <geom name="palm" size="0.03" pos="0.03 0 0" mass="0.2"/>
-    <geom name="thumb" size="0.02" pos="0 0.05 0.01" mass="0.1"/>
-</body></body></body></body></worldbody><sensor><framepos objtype="body" objname="mount"/></sensor>
-<actuator><motor joint="lift"/><motor joint="turn"/><motor joint="bend"/><motor joint="reach"/></actuator></mujoco>"""
-
 
 def make_jointed():
     """An arm with slides, several joints on a body, and reference angles; a body without joints is kept."""
-    return mujoco.MjSpec.from_string(JOINTED)
+    return read_robot("jointed")
 
 
-ROBOTS = {"walker": (make_walker, "fused"), "walker_slow": (make_walker, "mujoco_warp")}
-ROBOTS["jointed"] = (make_jointed, "mujoco_warp")
+ROBOTS = {"walker": (make_walker, "fused"), "jointed": (make_jointed, "mujoco_warp")}
 FEET = {"walker": (["Lfoot", "Rshin", "Rfoot"], [0, 1, 2]), "jointed": (["upper", "palm", "thumb"], [0, 1, 1])}
 """Geoms that stand for feet, and the foot of each."""
 LONGER = (0.1, 0.2, 0.3)
@@ -45,12 +31,12 @@ def moving(request):
     """A simulator after a step, the state of its robots, and for each world MuJoCo's data before and after it."""
     make, engine = ROBOTS[request.param]
     model = compiled(make())
-    geoms, foot_of = FEET[request.param.removesuffix("_slow")]
+    geoms, foot_of = FEET[request.param]
     states, sim = draw_states(model, 5, (0.1, 0.2)), make_engine(engine, model, 5, "cpu", 100, 50)
     places = [[model.geom(ref).name for ref in model.sensor_refid].index(name) for name in geoms]
     state = RobotState(sim, None, places, foot_of, 1, 0.02)
     longer = np.zeros((5, 3))
-    if make is make_walker:  # parameters per world need one hinge per body
+    if engine == "fused":  # parameters per world need one hinge per body
         longer[3] = LONGER
         sim.field("body_pos")[:, -1] += torch.tensor(longer)
     put(sim, states)

@@ -50,6 +50,14 @@ def test_same_in_time(preset, task, policy, physics):
     np.testing.assert_allclose(per_second(found), per_second(get_cfgs(*words, task=task, run_config=run)), rtol=1e-9)
 
 
+@pytest.mark.parametrize("preset", ["parallel", "paper"])
+def test_two_rates_are_the_same_per_second(preset):
+    """What happens at 200 Hz of torques and 50 Hz of positions is per second that of 50 Hz of both."""
+    words, tasks = [f"--preset={preset}", "--perturbation=high"], ("a1_multihead_two_rates", "a1_multihead")
+    fast, slow = (np.delete(per_second(get_cfgs(*words, task=task)), 9) for task in tasks)  # without held positions
+    np.testing.assert_allclose(fast, slow, rtol=1e-4)
+
+
 def test_same_motion():
     """Torques that are held give the same motion and the same rewards per second at two rates of the policy."""
     sums, poses = [], []

@@ -8,8 +8,6 @@ import pytest
 import torch
 from support.control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
 from support.episodes import HIGH_UP, time_out
-from support.reproducible import differences
-from support.resume import content, start, train
 from support.settings import error_of, get_cfgs, torques_in_torch
 from support.symmetry import mirror_policy
 
@@ -31,9 +29,6 @@ def to_steps(task, total_steps):
     task.update_curriculum()
 
 
-# ------------------------------------------------------------------------------------- curriculum with multi-head
-
-
 def test_curriculum_with_multi_head(make_task):
     """Torques are eq. 7 with a PD part that fades to 0; rewards have the nominal pose's, with its own weights."""
     task = make_task(CURRICULUM, 3)
@@ -49,9 +44,6 @@ def test_curriculum_with_multi_head(make_task):
         assert task.reward_weights()[place].item() == pytest.approx(0.02 * weight)
     tracking = task.cfg.rewards.curriculum.tracking_lin_vel
     assert (tracking.t_start, tracking.t_end) == (3_000_000, 13_000_000)
-
-
-# ------------------------------------------------------------------------------------------- gravity with the others
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
@@ -97,9 +89,6 @@ def test_tasks_that_cannot_give_torques(make_task):
         check_torques(make_task(name, 1))
 
 
-# ---------------------------------------------------------------------------------------------------- the higher pose
-
-
 def test_higher_pose(make_task):
     """In MuJoCo's kinematics its feet touch the ground at 0.33 m, below the same places as in the lower pose."""
     task, low = make_task(HIGH, 1), make_task("a1_torque_curriculum", 1)
@@ -119,9 +108,6 @@ def test_higher_pose(make_task):
     error = np.square(task.default_dof_pos.numpy() - NOMINAL).sum()
     task.dof_pos.copy_(low.default_dof_pos)
     assert task._reward_nominal_position().item() == pytest.approx(math.exp(-0.5 * error), rel=1e-4)
-
-
-# ---------------------------------------------------------------------------------------------------------- two rates
 
 
 def held(sent):
@@ -195,35 +181,3 @@ def test_two_rates_in_the_mirror(make_task):
     assert torch.equal(mirrored[..., 57], parts[..., 57])
     for step in range(2):
         torch.testing.assert_close(mirrored[:, step, :57], mirror_policy(parts[:, step, :57]))
-
-
-def test_two_rates_are_the_same_per_second():
-    """Discounts, random events and evaluated time at 200 Hz are per second those of 50 Hz."""
-    fast, slow = get_cfgs(task=TWO_RATES), get_cfgs(task="a1_multihead")
-    for words in ((), ("--preset=paper",)):
-        algorithms = [get_cfgs(*words, task=task)[1].algorithm for task in (TWO_RATES, "a1_multihead")]
-        for name in ("gamma", "lam"):
-            assert getattr(algorithms[0], name) ** 4 == pytest.approx(getattr(algorithms[1], name))
-    assert fast[1].evaluation.num_samples == 4 * slow[1].evaluation.num_samples
-    chances = [cfg[0].commands.resampling_probability for cfg in (fast, slow)]
-    chances += [cfg[0].domain_rand.resampling_probability for cfg in (fast, slow)]
-    chances += [cfg[0].domain_rand.push_probability for cfg in (fast, slow)]
-    named = [cfg[0].perturbations() for cfg in (fast, slow)]
-    assert named[0].keys() == named[1].keys()
-    for name in named[0]:
-        chances += [each[name]["domain_rand"].pop("push_probability") for each in named]
-    assert [4 * chance for chance in chances[::2]] == pytest.approx(chances[1::2])
-    assert named[0] == named[1]
-    assert fast[0].control.mixing.pd.end == 0.1
-
-
-def test_two_rates_resumed(tmp_path):
-    """Held actions go on: three iterations and one more are four, to the bit, in the middle of intervals."""
-    words = [f"--task={TWO_RATES}", "--set=runner.num_steps_per_env=3", "--set=env.history_length=1"]
-    words += ["--set=evaluation.interval=0", "--set=algorithm.annealing_start=1"]
-    whole, part = (train(tmp_path / name, count, *words) for name, count in (("whole", 4), ("part", 3)))
-    assert (part.env.episode_length_buf % INTERVAL != 0).any()
-    resumed = start(tmp_path / "resumed", *words, "--resume", f"--load_run={part.log_dir}")
-    resumed.claim_log_dir({})
-    resumed.learn(1, init_at_random_ep_len=True)
-    assert not differences(content(whole, 4), content(resumed, 4))

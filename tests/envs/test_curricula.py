@@ -33,9 +33,7 @@ def test_reward_curricula(make_task, name, term, start, end, t_start, t_end):
 def test_curricula_count_the_steps_of_all_worlds(make_task):
     """t of eq. 1 grows by the number of worlds with each step, and the step's own reward already uses it."""
     task = make_task(
-        "a1_torque",
-        3,
-        **{"rewards.curriculum.tracking_lin_vel.t_end": 12, "commands.resampling_probability": 0.0},
+        "a1_torque", 3, **{"rewards.curriculum.tracking_lin_vel.t_end": 12, "commands.resampling_probability": 0.0}
     )
     tracking = task.reward_names.index("tracking_lin_vel")
     assert task.total_steps.item() == 0

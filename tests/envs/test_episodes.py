@@ -17,8 +17,6 @@ def euler_by_hand(quat):
     return math.atan2(r[2, 1], r[2, 2]), -math.asin(r[2, 0]), math.atan2(r[1, 0], r[0, 0])
 
 
-# --------------------------------------------------------------------------------------------------- commands
-
 RANGES = {"lin_vel_x": [-1.0, 0.5], "lin_vel_y": [0.6, 0.75], "ang_vel_yaw": [-2.0, -1.5]}
 
 
@@ -48,9 +46,6 @@ def test_resampling_probability(make_task, probability):
         changed += differs.any(dim=1).sum().item()
     assert abs(changed - draws * probability) <= 4 * math.sqrt(draws * probability * (1 - probability))
     assert (task.episode_length_buf == 4).all()
-
-
-# --------------------------------------------------------------------------------------------------- episodes
 
 
 def test_time_out(make_task):
@@ -92,9 +87,6 @@ def test_reset_clears_what_belongs_to_the_episode(make_task):
         assert (buffer[0] == 0).all()
     assert (task.contacts[1] != 0).any() and (task.sim.qvel[1] != 0).any()
     assert (obs["policy"][0, 21:] == 0).all() and (obs["critic"][0, -121:-117] == 0).all()
-
-
-# --------------------------------------------------------------------------------------------------- initial states
 
 
 UPRIGHT = {"init_roll": [-math.pi / 16, math.pi / 16], "init_pitch": [-math.pi / 16, math.pi / 16]}

@@ -243,21 +243,6 @@ def test_breakdown_by_hand(task):
     assert table["lin_vel_x"][0]["error_standard_error"] == pytest.approx(np.sqrt(2 * 0.5**2 * 5 / 4) / 4)
 
 
-def test_breakdown_of_a_fixed_command(make_task):
-    """Each command is one part that begins and ends at it, even in a range without width."""
-    fixed = {"lin_vel_x": 0.5, "lin_vel_y": 0.0, "ang_vel_yaw": -0.2}
-    task = make_task("a1_position", 2, **{f"commands.ranges.{name}": [value] * 2 for name, value in fixed.items()})
-    breakdown = CommandBreakdown(task)
-    assert breakdown.table() == {name: [] for name in fixed}
-    for _ in range(3):
-        add(task, breakdown, commands=task.commands.clone(), lin_vel=[0.25, 0.5, 0.0], ang_vel=[0.0, 0.0, -0.1])
-    for (name, value), error in zip(fixed.items(), (0.25, 0.5, 0.1), strict=True):
-        (part,) = breakdown.table()[name]
-        expected = {"from": value, "to": value, "share": 1.0, "track_percentage": 0.5, "error": error}
-        expected |= {"track_percentage_standard_error": 0.0, "error_standard_error": 0.0}
-        assert part == pytest.approx(expected, abs=1e-6)
-
-
 def test_measure_uses_the_commands_of_the_step(make_task):
     """A step is compared with the command that held in it, although its end draws a new one; episodes begin anew."""
     task = make_task("a1_position", 3, **{"commands.resampling_probability": 1.0})

@@ -68,10 +68,7 @@ CASES = {
         4.25,
     ),
     # a trunk, a calf and two thighs on the ground; feet do not count
-    "collision": (
-        {"contacts": contact_flags("trunk", "FR_calf", "FL_thigh", "RL_thigh", "RL_foot", "FR_foot")},
-        4.0,
-    ),
+    "collision": ({"contacts": contact_flags("trunk", "FR_calf", "FL_thigh", "RL_thigh", "RL_foot", "FR_foot")}, 4.0),
     "base_height": ({"base_pos": [7.0, 8.0, 0.203]}, 0.01),
     # swings of 0.75 s and 0.3 s have ended, one foot has been down all the time, one flies: 0.25 - 0.2 - 0.5
     "feet_air_time": ({"feet_contact": [1.0, 1.0, 1.0, 0.0], "feet_air_time": [0.75, 0.3, 0.0, 0.9]}, -0.45),
@@ -101,9 +98,6 @@ def task(make_task):
     return task
 
 
-# --------------------------------------------------------------------------------------------------- terms
-
-
 @pytest.mark.parametrize("term", CASES)
 def test_term_by_hand(task, term):
     """A term has its by-hand value in the world that was put into its state, and its neutral value in the others."""
@@ -111,20 +105,6 @@ def test_term_by_hand(task, term):
     rest = NEUTRAL_VALUE.get(term, 0.0)
     value = getattr(task, f"_reward_{term}")()
     np.testing.assert_allclose(value, [rest, CASES[term][1], rest], rtol=2e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("in_air", "expected"),
-    [
-        ("FR FL", 1.0),
-        ("FR RR", 0.0),
-        ("FR FL RR RL", 2.0),
-    ],
-)
-def test_symmetry_pairs(task, in_air, expected):
-    """Only a left and a right foot of the same end make a pair."""
-    task.feet_contact[:] = torch.tensor([0.0 if leg in in_air.split() else 1.0 for leg in LEGS])
-    assert task._reward_symmetry().tolist() == [expected] * 3
 
 
 def test_collision_counts_every_leg(task):
@@ -138,18 +118,13 @@ def test_collision_counts_every_leg(task):
 def test_temperatures(make_task):
     """The tracking and nominal-position temperatures are settings."""
     task = make_task(
-        "a1_torque_curriculum",
-        1,
-        **{"rewards.tracking_temperature": 1.0, "rewards.nominal_position_temperature": 2.0},
+        "a1_torque_curriculum", 1, **{"rewards.tracking_temperature": 1.0, "rewards.nominal_position_temperature": 2.0}
     )
     neutral(task)
     for term, expected in (("tracking_lin_vel", -0.3125), ("tracking_ang_vel", -0.25), ("nominal_position", -3.6)):
         neutral(task)
         construct(task, 0, term)
         assert getattr(task, f"_reward_{term}")().item() == pytest.approx(math.exp(expected), rel=1e-5)
-
-
-# --------------------------------------------------------------------------------------------------- weights and sum
 
 
 @pytest.mark.parametrize("decimation", [4, 2])
@@ -185,11 +160,7 @@ def test_reward_is_the_weighted_sum(make_task):
 
 @pytest.mark.parametrize(
     ("height", "clip", "expected"),
-    [
-        (0.403, True, 0.02 * (4.1 - 30 * 0.01)),
-        (0.703, True, 0.0),
-        (0.703, False, 0.02 * (4.1 - 30 * 0.16)),
-    ],
+    [(0.403, True, 0.02 * (4.1 - 30 * 0.01)), (0.703, True, 0.0), (0.703, False, 0.02 * (4.1 - 30 * 0.16))],
 )
 def test_negative_sums_are_clipped(make_task, height, clip, expected):
     """A negative sum becomes 0 and a positive one stays, unless clipping is switched off."""

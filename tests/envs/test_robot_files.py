@@ -7,16 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.robot_files import (
-    A1,
-    EVEN_TRUNK,
-    joint,
-    servo,
-    setting,
-    shuffle_motors,
-    turn_left_hips,
-    unitree_order,
-)
+from support.robot_files import A1, EVEN_TRUNK, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
 from support.robot_files import changed as changed  # a fixture
 from support.scripts import run_here
 from support.settings import error_of
@@ -48,9 +39,6 @@ def torques_of(file, ctrl):
     return {name: data.joint(name).qfrc_actuator[0] for name in POSE}
 
 
-# --------------------------------------------------------------------------------------------------- orders
-
-
 def test_the_same_robot_in_another_order(changed, make_task):
     """Unitree's orders of joints and motors lead to the same torques per joint, rewards and observations as ours."""
     ours = make_task("a1_torque_multihead", 2)
@@ -68,8 +56,6 @@ def test_the_same_robot_in_another_order(changed, make_task):
         assert all(torch.equal(group, ours.obs_buf[name]) for name, group in theirs.obs_buf.items())
     assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
 
-
-# --------------------------------------------------------------------------------------------------- motors
 
 LIMITS = {
     "ctrlrange alone": [setting(".//default/motor", forcerange=None)],
@@ -108,9 +94,6 @@ def test_servos_are_refused(changed, make_task, engine):
     assert f"make a <motor> with a forcerange of what is {advice}" in message
     model = build_model(read_spec(file), [])
     assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(make_engine, engine, model, 1)
-
-
-# --------------------------------------------------------------------------------------------------- refusals
 
 
 def remove(path):
@@ -186,9 +169,6 @@ def test_all_problems_at_once(changed):
         assert part in message
 
 
-# --------------------------------------------------------------------------------------------------- notes
-
-
 def test_notes(changed):
     """A robot that no view draws and legs without feet or with two are noted."""
     hidden = [setting(".//default[@class='visual']/geom", group="4")]
@@ -229,9 +209,6 @@ def test_another_robot_than_in_training(changed, tmp_path):
     assert "other axes than the robot of the training: FL_hip_joint, RL_hip_joint are seen and driven wrongly" in axes
     assert mass == "asset.file has 13.453 kg, the robot of the training 12.453 kg"
     assert "which is gone" in next(robot_notes(other, tmp_path / "gone.xml"))
-
-
-# --------------------------------------------------------------------------------------------------- symmetry
 
 
 def test_mirror_images_follow_axes(changed, make_task):

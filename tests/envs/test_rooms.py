@@ -17,9 +17,6 @@ from legged_torque.utils.mirroring import SCALAR
 LEGS = ("FR", "FL", "RR", "RL")
 
 
-# ------------------------------------------------------------------------------------------------ robots
-
-
 def test_gains_by_joint():
     """Numbers go by a part of the joints' names; joints without one and names without a joint are refused."""
     names = [f"{leg}_{part}_joint" for leg in LEGS for part in ("hip", "calf")]
@@ -46,9 +43,6 @@ def test_robot_without_mirrored_legs(make_task):
     task = make_task("a1_torque", 1, **settings, **{"rewards.scales.symmetry": 0.0})
     task.step(torch.zeros(1, 12))
     assert "'FR_hip_joint' has no counterpart" in error_of(lambda: task.mirror)
-
-
-# ------------------------------------------------------------------------------------------------ terms and parameters
 
 
 @pytest.mark.parametrize(
@@ -95,9 +89,6 @@ def test_parameters_that_do_not_fit(make, message):
     assert message in error_of(lambda: Robot(cfg).mirror)
 
 
-# ------------------------------------------------------------------------------------------------ ground
-
-
 class Raised(Plane):
     """Ground that is 0.1 m higher for the task than in the physics."""
 
@@ -121,8 +112,7 @@ def test_a_ground_comes_without_touching_tasks(make_task, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("setting", "value", "nearest"),
-    [("motors.chain", ["idael"], "ideal"), ("terrain.mesh_type", "plan", "plane")],
+    ("setting", "value", "nearest"), [("motors.chain", ["idael"], "ideal"), ("terrain.mesh_type", "plan", "plane")]
 )
 def test_unknown_rooms(make_task, setting, value, nearest):
     """A name that does not exist is refused with the nearest one."""

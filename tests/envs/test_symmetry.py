@@ -47,9 +47,6 @@ def mirror_drawn(drawn):
 BY_HAND = {"policy": mirror_policy, "critic": mirror_critic, "actions": mirror_joints}
 
 
-# --------------------------------------------------------------------------------------------------- mirror images
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_mirrored_twice(make_task, name):
     """Mirroring is as by hand, no identity, and its own inverse."""
@@ -87,9 +84,6 @@ def test_counterparts():
         counterparts(["FR_hip", "left_hip"], pairs)
     with pytest.raises(UserError, match="'RL_hip' has no counterpart: asset"):
         counterparts(["RL_hip"], pairs)
-
-
-# --------------------------------------------------------------------------------------------------- learning
 
 
 @pytest.fixture(scope="module")

@@ -18,20 +18,36 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_torque.utils.runs import checkpoint_numbers
 
+WATCHED = """
+import runpy, sys
+import torch
+from warp._src import context
+from legged_torque.experiments.local_launcher import LocalLauncher
+start = LocalLauncher.start
+def watched(*arguments):
+    print("initialized:", torch.cuda.is_initialized(), context.runtime, flush=True)
+    return start(*arguments)
+LocalLauncher.start = watched
+sys.argv = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""Runs a script, and tells what it has initialized when it starts a training."""
+
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
     """A smoke experiment of one cell that was killed in the middle of its training.
 
     Returns:
-        Its file and its folder.
+        Its file, its folder and what it has printed.
     """
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
-    values["train"] |= {"runner.total_steps": 20 * 32, "runner.save_interval": 2}
+    values["train"] |= {"runner.total_steps": 40 * 32, "runner.save_interval": 2}
     values |= {"tasks": ["a1_torque_multihead"], "environments": {"low": ["high"]}}
     tmp_path = tmp_path_factory.mktemp("killed")
     file, out = write(tmp_path / "smoke.yaml", values), tmp_path / "out"
-    command = [sys.executable, ROOT / "scripts" / "experiment.py", file, f"--out={out}", "--device=cpu"]
+    command = [sys.executable, "-c", WATCHED, ROOT / "scripts" / "experiment.py"]
+    command += [file, f"--out={out}", "--device=cpu"]
     with open(tmp_path / "output", "w") as output:
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         process = subprocess.Popen(
@@ -42,17 +58,22 @@ def killed(tmp_path_factory):
     process.wait()
     cell = out / "a1_torque_multihead-low-s1"
     wait_for(lambda: "Stopping after this iteration and saving" in (cell / "train.log").read_text())
-    return file, out
+    return file, out, (tmp_path / "output").read_text()
 
 
 @pytest.fixture(scope="module")
 def finished(killed, tmp_path_factory):
     """The same experiment after the same command once more: its file, its folder and what was printed."""
-    file, out = killed
+    file, out, _ = killed
     words = [file, f"--out={out}", "--device=cpu"]
     status, output, error = experiment_here(*words, tmp_path=tmp_path_factory.mktemp("root"))
     assert (status, error) == (0, ""), output + error
     return file, out, output
+
+
+def test_no_device_is_touched(killed):
+    """Reading a matrix and choosing workers starts neither CUDA nor Warp: GPUs belong to the trainings."""
+    assert "initialized: False None\n" in killed[2]
 
 
 def test_killed_in_the_middle_of_training(finished):
@@ -60,12 +81,12 @@ def test_killed_in_the_middle_of_training(finished):
     _, out, _ = finished
     first, second = sorted(path for path in (out / "a1_torque_multihead-low-s1").iterdir() if path.is_dir())
     last = max(checkpoint_numbers(first))
-    assert 2 <= last < 20
-    state = torch.load(second / "model_20.pt", weights_only=True)
-    assert (state["iter"], state["infos"]["total_timesteps"]) == (20, 20 * 32)
-    assert yaml.safe_load((second / "config.yaml").read_text())["max_iterations"] == 20
+    assert 2 <= last < 40
+    state = torch.load(second / "model_40.pt", weights_only=True)
+    assert (state["iter"], state["infos"]["total_timesteps"]) == (40, 40 * 32)
+    assert yaml.safe_load((second / "config.yaml").read_text())["max_iterations"] == 40
     events = EventAccumulator(str(second)).Reload()
-    assert [event.step for event in events.Scalars("Loss/value")] == list(range(last, 20))
+    assert [event.step for event in events.Scalars("Loss/value")] == list(range(last, 40))
 
 
 def test_smoke_experiment_runs_to_the_end(finished):
@@ -74,9 +95,9 @@ def test_smoke_experiment_runs_to_the_end(finished):
     cell = out / "a1_torque_multihead-low-s1"
     result = json.loads((cell / "result_high.json").read_text())
     assert (result["task"], result["perturbation"]) == ("a1_torque_multihead", "high")
-    assert (result["checkpoint"], result["num_envs"], result["num_steps"]) == ("model_20.pt", 4, 20)
+    assert (result["checkpoint"], result["num_envs"], result["num_steps"]) == ("model_40.pt", 4, 20)
     log = (cell / "train.log").read_text()
-    assert log.count("scripts/train.py") == 2 and log.count(" --resume") == 1 and "iteration 20 of 20, " in log
+    assert log.count("scripts/train.py") == 2 and log.count(" --resume") == 1 and "iteration 40 of 40, " in log
     assert f"{cell.name}: evaluation in high on cpu took" in output and not list(cell.glob("*.part"))
     assert "1 of 1 cells done" in output and output.endswith("1 of 1 cells are done.\n")
 
@@ -89,7 +110,7 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert (status, error, contents(out)) == (0, "", before)
     first, spent, last = output.splitlines()
     assert (first, last) == (f"1 of 1 cells are done in {out}", "1 of 1 cells are done.")
-    assert " of CPU time for training; 640 steps of training, " in spent
+    assert " of CPU time for training; 1280 steps of training, " in spent
 
 
 @pytest.mark.parametrize(("name", "cells"), {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}.items())
@@ -145,17 +166,3 @@ def test_mistakes_in_the_command_line(words, message, tmp_path):
     words = [word.format(**{name: tmp_path / name for name in texts}) for word in words]
     assert_told_in_one_line(experiment_here(*words, f"--out={tmp_path / 'out'}", tmp_path=tmp_path), message)
     assert not (tmp_path / "out").exists()
-
-
-def test_no_device_is_touched():
-    """Reading a matrix and choosing workers starts neither CUDA nor Warp: GPUs belong to the trainings."""
-    code = (
-        "from pathlib import Path; import torch, warp; from warp._src import context\n"
-        "from legged_torque.experiments.matrix import read_matrix\n"
-        "from legged_torque.experiments.local_launcher import LocalLauncher\n"
-        "read_matrix(Path('experiments/low.yaml')); LocalLauncher('auto', None)\n"
-        "print(torch.cuda.is_initialized(), context.runtime)"
-    )
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env=environment)
-    assert (done.returncode, done.stdout) == (0, "False None\n"), done.stderr

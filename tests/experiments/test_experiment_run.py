@@ -79,10 +79,7 @@ def test_a_training_that_is_killed_is_tried_again(stage, tmp_path):
 
 @pytest.mark.parametrize(
     ("behaviour", "message"),
-    [
-        ("early", "training has ended after 2 of 4 iterations"),
-        ("broken", "evaluation in low has left no readable"),
-    ],
+    [("early", "training has ended after 2 of 4 iterations"), ("broken", "evaluation in low has left no readable")],
 )
 def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     """Exit status 0 is not enough; what is incomplete does not become a result."""

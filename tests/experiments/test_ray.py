@@ -22,10 +22,10 @@ from legged_torque.experiments.ray_node import write_files
 FAST = {
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 200,
-    "health_check_timeout_ms": 1000,
+    "health_check_timeout_ms": 60_000,  # for an answer: a machine that is just slow is not gone
     "health_check_failure_threshold": 2,
 }
-"""Settings by which Ray soon notices that a machine is gone."""
+"""Settings by which Ray soon notices that a machine is gone: nothing answers there."""
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,7 @@ def cluster(stage):
     handler = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_AUTH_MODE", "disabled")  # which would write a token into the home folder
+        patch.setenv("RAY_TQDM_PATCH_PRINT", "0")  # which would stay in this process
         patch.setenv("PYTHONPATH", str(stage))
         head = {"num_cpus": 0, "include_dashboard": False, "_system_config": FAST}
         cluster = Cluster(initialize_head=True, head_node_args=head)

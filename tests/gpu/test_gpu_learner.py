@@ -1,72 +1,32 @@
 """PPO's Triton kernels, compiled for the GPU, in TF32 and bfloat16, against torch's autograd, Adam and formulas."""
 
-import copy
-
 import numpy as np
 import pytest
 import torch
-from rsl_rl.models import MLPModel
-from rsl_rl.storage import RolloutStorage
 from support.capture import gradient_errors
-from support.rollouts import SETTINGS, parameters, random_obs, record_rollout
+from support.rollouts import record_rollout
+from support.wide_ppo import STEPS, assert_steps_are_those_of_torch, build, choose
 
-from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.multi_head import MultiHeadModel
 from legged_torque.learning.ppo import OnDevicePPO
 
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 
-STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
-MIRROR = {  # an order that is its own inverse, and signs
-    "policy": ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, 1.0, 1.0]),
-    "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
-    "actions": ([3, 4, 5, 0, 1, 2], [-1.0, 1.0, 1.0, -1.0, 1.0, 1.0]),
-}
 TOLERANCES = {"TF32": 0.04, "bfloat16": 0.1}
 """Largest norm of a gradient's error, in parts of the gradient's: the gradients of samples mostly cancel.
 
 Up to 2.2% were seen in TF32, on an H100."""
 
 
-class Mirrored:
-    """As much of a task as learning from mirror images needs."""
-
-    def __init__(self, device):
-        self.maps = {
-            name: (torch.tensor(order, device=device), torch.tensor(signs, device=device))
-            for name, (order, signs) in MIRROR.items()
-        }
-        self.mirror = lambda name, values: values[:, self.maps[name][0]] * self.maps[name][1]
-        self.mirror.maps = self.maps
-
-
-def make(device, multi_head=False, symmetric=False, precision="TF32", **settings):
-    """An algorithm with kernels, whose layers are wider than a tile, no multiple of one, and no power of two."""
+def make(device, precision="TF32", **settings):
+    """An algorithm with kernels."""
     if precision == "bfloat16" and device == "cpu":
         pytest.skip("needs a GPU")
-    torch.manual_seed(0)
-    distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": "log"}
-    obs, groups = random_obs(WORLDS).to(device), {"actor": ["policy"], "critic": ["critic"]}
-    arguments = (obs, groups, "actor", NUM_ACTIONS, [72, 136], "elu", False, distribution)
-    actor = MultiHeadModel(*arguments, head_hidden_dims=[40]) if multi_head else MLPModel(*arguments)
-    critic = MLPModel(obs, groups, "critic", 1, [200, 24, 16], "elu")
-    storage = RolloutStorage("rl", WORLDS, STEPS, obs, [NUM_ACTIONS], device)
-    if symmetric:
-        function = "legged_torque.envs.base.symmetry:with_mirror_images"
-        settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
-        settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored(device)}
-    settings = SETTINGS | {"device": device, "use_mixed_precision": precision == "bfloat16"} | settings
     from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO
 
-    alg = (TritonPPO if device == "cpu" else OnDevicePPO.make)(actor, critic, storage, **settings)
+    kind = TritonPPO if device == "cpu" else OnDevicePPO.make
+    alg = build(kind, device, use_mixed_precision=precision == "bfloat16", **settings)
     assert type(alg) is TritonPPO and (alg.product_dtype == torch.bfloat16) == (precision == "bfloat16")
     return alg
-
-
-def choose(alg, seed):
-    """Let the algorithm learn from some of the samples next."""
-    order = torch.randperm(STEPS * WORLDS, generator=torch.Generator().manual_seed(seed))
-    alg.indices.copy_(order[: alg.batch_size])
 
 
 @pytest.mark.parametrize("precision", TOLERANCES)
@@ -111,7 +71,7 @@ def test_gradients(device, precision):
         alg = make(device, precision=precision, max_grad_norm=1e9, clip_param=10.0, learning_rate=1e-2, **kind)
         record_rollout(alg)
         for number in range(3):
-            choose(alg, number)
+            choose([alg], number)
             errors = gradient_errors(alg)
             assert max(errors.values()) < close, errors
             expected = alg.loss()[1].tolist()
@@ -122,22 +82,9 @@ def test_gradients(device, precision):
 
 
 def test_steps_are_those_of_torch(device):
-    """Adam of torch, in float64 and given the same gradients, which are clipped as torch clips them."""
+    """Those of torch's Adam."""
     alg = make(device, max_grad_norm=0.05)
-    models = (copy.deepcopy(alg.actor).double(), copy.deepcopy(alg.critic).double())
-    theirs = [*models[0].parameters(), *models[1].parameters()]
-    reference = torch.optim.Adam(theirs, lr=1e-3)
-    record_rollout(alg)
-    for number in range(3):
-        choose(alg, number)
-        alg.update_graph()
-        for parameter, gradient in zip(theirs, alg.gradients(), strict=True):
-            parameter.grad = gradient.double()
-        for model in models:
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 0.05)
-        reference.step()
-    for own, other in zip(parameters(alg).values(), theirs, strict=True):
-        torch.testing.assert_close(own.double(), other, rtol=1e-4, atol=1e-6)
+    assert_steps_are_those_of_torch(alg, alg.update_graph, rtol=1e-4, atol=1e-6)
 
 
 def test_a_bad_sample_changes_nothing(device):

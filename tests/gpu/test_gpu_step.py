@@ -110,8 +110,6 @@ def test_bad_numbers_end_their_world(device):
     assert int(broken.num_diverged) == 3 and int(healthy.num_diverged) == 0
 
 
-# ------------------------------------------------------------------------------------------------- drawn at random
-
 NUM = 4096
 MANY = [*WORDS, f"--num_envs={NUM}"]
 HIGH_UP = "--set=init_state.pos=[0,0,50]"  # nothing falls

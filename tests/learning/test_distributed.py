@@ -3,6 +3,7 @@
 Started by torchrun (:func:`train_together`), this file is the process that trains and notes what it sees.
 """
 
+import contextlib
 import os
 import re
 import shutil
@@ -22,6 +23,7 @@ from support.settings import parse
 from legged_torque.envs import task_registry
 from legged_torque.learning.guard import PATIENCE
 from legged_torque.utils import distributed
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import set_seed
@@ -32,23 +34,27 @@ ALL_STEPS = 2 * WORLDS * STEPS
 """Environment steps of an iteration of both processes."""
 SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--set=algorithm.num_mini_batches=2"]
 SMALL += ["--set=algorithm.annealing_start=1", "--set=evaluation.interval=0"]  # trainings of other lengths are compared
-SCRIPT = ["--task=a1_position", "--device=cpu", "--logger=none", "--set=runner.save_interval=20", "--verbose", *SMALL]
+TASK = "a1_multihead"
+FOREVER = 1_000_000
+GOES_ON = f"iteration 5 of {FOREVER + 4}"
+"""What the first process prints when both train until torchrun is killed."""
 FORMULA = {"num_mini_batches": 1, "schedule": "adaptive", "max_grad_norm": 1e6, "learning_rate": 1e-3}
 MULTI_GPU = {"world_size": 2, "local_rank": 0}
 
 
-# --------------------------------------------------------------------------------------------------- in the processes
-
-
-def make_runner(log_root):
-    """The runner of this process, whose critic normalizes its observations."""
-    args = parse("--task=a1_multihead", *SMALL)
+def make_runner(log_root, normalized=False):
+    """The runner of this process, whose critic may normalize its observations; the first one begins its run."""
+    args = parse(f"--task={TASK}", *SMALL)
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     train_cfg.runner.logger = "none"
-    train_cfg.critic.obs_normalization = True
+    if normalized:
+        train_cfg.critic.obs_normalization = True
     set_seed(train_cfg.seed)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
-    return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
+    runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=log_root)
+    if log_root and distributed.rank() == 0:
+        runner.claim_log_dir({"task": TASK, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
+    return runner
 
 
 def everything(runner):
@@ -61,10 +67,8 @@ def everything(runner):
 
 
 def train(folder):
-    """Train, stop when the second process is asked to, save, and load in both processes."""
+    """Train, stop when the second process is asked to, save, load in both processes, and go on until torchrun ends."""
     runner = make_runner(folder / "logs")
-    if distributed.rank() == 0:
-        runner.claim_log_dir({})
     start = everything(runner)
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
@@ -82,7 +86,7 @@ def train(folder):
         return update()
 
     runner.alg.update = update_with_signal
-    runner.learn(1000)
+    runner.learn(FOREVER)
     notes["stopped"] = everything(runner)
     resumed = make_runner(None)
     resumed.load(str(kept / "model_2.pt"))
@@ -90,7 +94,12 @@ def train(folder):
     resumed.resume(str(kept / "model_2.pt"))
     resumed.learn(1)
     notes["resumed"] = everything(resumed)
+    normalized = make_runner(None, normalized=True)
+    normalized.learn(2)
+    notes["normalized"] = everything(normalized)
     notes["given_up"] = give_up()
+    runner.learn(FOREVER)
+    notes["left alone"] = everything(runner)
     runner.close()
     return notes
 
@@ -132,9 +141,6 @@ def main(folder):
     torch.save(notes, folder / f"{distributed.rank()}.pt")
 
 
-# --------------------------------------------------------------------------------------------------- the tests
-
-
 def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
     """Start processes that find each other, two on this machine unless ``launch`` says otherwise."""
     paths = os.pathsep.join([str(ROOT), *map(str, Path(__file__).parents[:2]), *sys.path])
@@ -145,13 +151,25 @@ def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
     )
 
 
+def read_until(process, text):
+    """What a process prints, until a line has some text."""
+    output = ""
+    for line in process.stdout:
+        output += line
+        if text in line:
+            break
+    return output
+
+
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
     """The folder in which two processes have trained, and the notes of both."""
     folder = tmp_path_factory.mktemp("together")
     with torchrun(__file__, folder) as process:
-        output, _ = process.communicate(timeout=300)
-    assert process.returncode == 0, output
+        output = read_until(process, GOES_ON)
+        process.kill()
+        output += process.communicate(timeout=300)[0]  # which waits for all of them
+    assert {file.name for file in folder.glob("?.pt")} == {"0.pt", "1.pt"}, output
     return folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)], output
 
 
@@ -165,12 +183,10 @@ def test_one_policy_in_different_worlds(together):
     _, (first, second), _ = together
     assert not same(first["start"], second["start"])
     assert not torch.equal(first["observations"], second["observations"])
-    for moment in ("trained", "stopped", "resumed"):
+    for moment in ("trained", "stopped", "resumed", "normalized"):
         assert same(first[moment], second[moment])
     assert not same(first["trained"], first["stopped"])
-    normalizer = [key for key in first["trained"] if "obs_normalizer" in key]
-    assert "critic.obs_normalizer.count" in normalizer
-    assert int(first["trained"]["critic.obs_normalizer.count"]) == 2 * ALL_STEPS
+    assert int(first["normalized"]["critic.obs_normalizer.count"]) == 2 * ALL_STEPS
 
 
 def test_steps_of_both_count(together):
@@ -191,8 +207,18 @@ def test_a_signal_to_one_process_stops_both(together):
     """Both finish the iteration in which the second one was asked to stop, and the first one saves."""
     folder, (first, second), _ = together
     assert int(first["stopped"]["iterations"]) == int(second["stopped"]["iterations"]) == 4
-    files = {path.name for path in folder.glob("logs/*/*") if path.is_file()}
-    assert files == {"config.yaml", "worlds_4.pt", *(f"model_{iterations}.pt" for iterations in (0, 2, 3, 4))}
+    (run,) = (folder / "logs").iterdir()
+    last = int(first["left alone"]["iterations"])
+    files = {"config.yaml", f"worlds_{last}.pt", *(f"model_{iterations}.pt" for iterations in (0, 2, 3, 4, last))}
+    assert {path.name for path in run.iterdir() if path.is_file()} >= files
+
+
+def test_processes_end_with_torchrun(together):
+    """If it is killed, they save the iteration that both have finished, and end."""
+    folder, (first, second), _ = together
+    assert same(first["left alone"], second["left alone"])
+    last = find_checkpoint(next((folder / "logs").iterdir()), None)
+    assert checkpoint_number(last) == int(first["left alone"]["iterations"]) > 4
 
 
 def test_both_resume(together):
@@ -243,54 +269,11 @@ def test_bad_numbers_in_one_process_are_skipped_by_both(together):
         assert same(before, after)
 
 
-@pytest.fixture(scope="module")
-def script(tmp_path_factory):
-    """A run of train.py that Ctrl-C has ended, the run as it was at iteration 20, and what was printed."""
-    folder, output = tmp_path_factory.mktemp("script"), ""
-    with torchrun(ROOT / "scripts" / "train.py", *SCRIPT, f"--log_root={folder}", "--max_iterations=100000") as process:
-        for line in process.stdout:
-            output += line
-            if "Learning iteration 20/" in line:
-                (run,) = (folder / "a1_position").iterdir()
-                kept = shutil.copytree(run, folder / "kept" / "a1_position" / run.name)
-                process.send_signal(signal.SIGINT)
-                break
-        output += process.communicate(timeout=120)[0]
-    return run, kept, output
+def test_two_machines_without_shared_files(together, tmp_path):
+    """A process on each goes on from the run that the first has; they learn what two on one machine do, bit by bit.
 
-
-def test_train_script_in_two_processes(script):
-    """One folder, one set of prints, and Ctrl-C saves the iteration that both have finished."""
-    run, _, output = script
-    checkpoint = find_checkpoint(run, None)
-    count = checkpoint_number(checkpoint)
-    state = torch.load(checkpoint, weights_only=True)
-    config = yaml.safe_load((run / "config.yaml").read_text())
-    assert count > 20 and state["infos"]["total_timesteps"] == count * ALL_STEPS
-    assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
-    assert output.count("Training a1_position on 2 x CPU") == output.count("Learning iteration 1/") == 1
-    assert f"{2 * WORLDS} worlds" in output and output.count(f"The run is in {run}") == 1
-
-
-def test_processes_end_with_torchrun(tmp_path):
-    """If it is killed, they save the iteration that both have finished, and end."""
-    words = [*SCRIPT, f"--log_root={tmp_path}", "--max_iterations=100000"]
-    with torchrun(ROOT / "scripts" / "train.py", *words) as process:
-        for line in process.stdout:
-            if "Learning iteration 3/" in line:
-                process.kill()
-                break
-        output = process.communicate(timeout=60)[0]  # which waits for all of them
-    (run,) = (tmp_path / "a1_position").iterdir()
-    assert checkpoint_number(find_checkpoint(run, None)) >= 3, output
-
-
-def test_two_machines_without_shared_files(script, tmp_path):
-    """A process on each goes on from the run that the first has; they learn what two on one machine do, bit by bit."""
-    run, kept, _ = script
-    checkpoint = find_checkpoint(run, None)
-    shutil.copytree(kept.parents[1], tmp_path / "0")
-    (tmp_path / "1").mkdir()
+    There is one folder and one set of prints, and Ctrl-C saves the iteration that both have finished.
+    """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -301,17 +284,34 @@ def test_two_machines_without_shared_files(script, tmp_path):
         options = dict(word.split("=") for word in line.split())
         assert ours.keys() < options.keys()
         launches.append([f"{name}={value}" for name, value in (options | ours).items()])
-    words = [ROOT / "scripts" / "train.py", *SCRIPT, f"--max_iterations={checkpoint_number(checkpoint)}", "--resume"]
-    both = [
-        torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=launch) for node, launch in enumerate(launches)
-    ]
-    outputs = [process.communicate(timeout=120)[0] for process in both]
-    assert [process.returncode for process in both] == [0, 0], outputs
-    assert "Training a1_position on 2 x CPU" in outputs[0] and "start anew" not in outputs[0]
-    assert "Learning iteration" not in outputs[1] and not list((tmp_path / "1").iterdir())
-    (resumed,) = (path for path in (tmp_path / "0" / "a1_position").iterdir() if path.name != kept.name)
-    one, other = (dict(values(torch.load(file, weights_only=True))) for file in (checkpoint, resumed / checkpoint.name))
-    assert not differences(one, other)
+    runs = tmp_path / "0" / TASK
+    kept = shutil.copytree(together[0] / "kept", runs / "2026-01-01_00-00-00")
+    (tmp_path / "1").mkdir()
+    words = [ROOT / "scripts" / "train.py", f"--task={TASK}", "--device=cpu", "--logger=none", "--verbose", "--resume"]
+    words += [f"--max_iterations={FOREVER}", "--set=runner.save_interval=1"]
+    with contextlib.ExitStack() as stack:
+        first, second = (
+            stack.enter_context(torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=launch))
+            for node, launch in enumerate(launches)
+        )
+        output = read_until(first, "Learning iteration 5/")
+        for process in (first, second):
+            process.send_signal(signal.SIGINT)
+        output += first.communicate(timeout=120)[0]
+        other = second.communicate(timeout=120)[0]
+    assert output.count(f"Training {TASK} on 2 x CPU") == output.count("Learning iteration 3/") == 1, output + other
+    assert f"{2 * WORLDS} worlds" in output and "start anew" not in output
+    assert "Learning iteration" not in other and not list((tmp_path / "1").iterdir())
+    (resumed,) = (path for path in runs.iterdir() if path != kept)
+    assert output.count(f"The run is in {resumed}") == 1
+    last = find_checkpoint(resumed, None)
+    count = checkpoint_number(last)
+    assert count > 5 and torch.load(last, weights_only=True)["infos"]["total_timesteps"] == count * ALL_STEPS
+    config = yaml.safe_load((resumed / "config.yaml").read_text())
+    assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
+    file = next((together[0] / "logs").glob("*/model_3.pt"))
+    one, twin = (dict(values(torch.load(path, weights_only=True))) for path in (file, resumed / file.name))
+    assert not differences(one, twin)
 
 
 if __name__ == "__main__":

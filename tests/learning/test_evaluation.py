@@ -48,7 +48,7 @@ def by_evaluation(steps, training):
     return [list(notes) for task, notes in groupby(steps, lambda note: note.task) if task is not training]
 
 
-WHEN = {24: [32, 48, 80], 16: [16, 32, 48, 64, 80], 5: [16, 32, 48, 64, 80], 50: [64, 80], 81: [80], 0: None}
+WHEN = {24: [32, 48, 80], 5: [16, 32, 48, 64, 80], 81: [80], 0: None}
 
 
 @pytest.mark.parametrize(("interval", "steps"), WHEN.items())

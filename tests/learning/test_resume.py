@@ -8,7 +8,7 @@ import pytest
 import torch
 from support.random_stream import upcoming
 from support.reproducible import differences, values
-from support.resume import WORLDS, content, start, train
+from support.resume import WORLDS, begin, content, start, train
 from support.settings import error_of
 
 from legged_torque.learning import checkpoint
@@ -58,12 +58,15 @@ OTHERS = {
     "hard": ["--ranges=hard", "--set=domain_rand.push_probability=0.5", "--set=domain_rand.resampling_probability=0.5"],
     "rough": ["--task=a1_rough_torque_multihead_scan", "--set=terrain.num_rows=3"],
 }
+OTHERS["two rates"] = ["--task=a1_multihead_two_rates", "--set=runner.num_steps_per_env=3"]  # ends within intervals
+OTHERS["two rates"] += ["--set=env.history_length=1", "--set=evaluation.interval=0"]
 OTHERS["rough"] += ["--set=terrain.max_init_terrain_level=2", "--set=terrain.border_size=1"]
+OTHERS["rough"] += ["--set=motors.delay.unit=control_steps", "--set=control.refresh_torques=false"]  # a shared kernel
 
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_two_and_two_are_four_elsewhere(tmp_path, name):
-    """The other engine, ranges that change everything often, and a map with levels keep nothing else."""
+    """The other engine, ranges that change everything often, held actions and a map with levels keep nothing else."""
     words = OTHERS[name]
     whole, half = (train(tmp_path / folder, count, *words) for folder, count in (("whole", 4), ("half", 2)))
     go_on(half, tmp_path / "resumed", whole, *words)
@@ -205,43 +208,27 @@ def test_what_killed_processes_have_left_is_removed(copied):
     assert not dead.exists() and alive.exists()
 
 
-@pytest.mark.parametrize("fault", [OSError(28, "No space left on device"), RuntimeError("broken")])
-def test_curves_that_cannot_be_written(tmp_path, capsys, fault):
-    """Training goes on without them and leaves its checkpoint; a line says so once."""
+def test_files_that_cannot_be_written(tmp_path, capsys):
+    """Training goes on without curves, evaluations and worlds, and leaves its checkpoint; a line each says so."""
 
     class Writer:
         """Fails from the first number on."""
 
         def add_scalar(self, *_):
-            raise fault
+            raise OSError(28, "No space left on device")
 
-    runner = start(tmp_path)
-    runner.claim_log_dir({})
+    runner = begin(tmp_path)
+    folder = Path(runner.log_dir)
     runner.logger.init_logging_writer = lambda: setattr(runner.logger, "writer", Writer())
-    runner.learn(3)
-    output, error = capsys.readouterr()
-    assert error.count("\n") == 1 and error.startswith("Warning: logs end here: ")
-    assert re.findall(r"iteration (\d) of 3", output)[-1] == "3" and (Path(runner.log_dir) / "model_3.pt").is_file()
-    assert runner.logger.tot_timesteps == 3 * 4 * WORLDS
-
-
-def test_worlds_that_cannot_be_written(tmp_path, capsys):
-    """The checkpoint is kept without them, and the last worlds stay with theirs."""
-    runner = train(tmp_path, 1)
-    (Path(runner.log_dir) / "worlds_2.pt").mkdir()
+    (folder / "evaluations.csv").mkdir()
     runner.learn(1)
-    assert capsys.readouterr().err.startswith("Warning: worlds would start anew in a resumed run: cannot write '")
-    files = {path.name for path in Path(runner.log_dir).glob("*.pt*") if path.is_file()}
-    assert files == {"model_0.pt", "model_1.pt", "worlds_1.pt", "model_2.pt"}
+    (folder / "worlds_2.pt").mkdir()
+    runner.learn(1)
+    output, error = capsys.readouterr()
+    parts = ("logs end here", "an evaluation is not kept: cannot write '", "worlds would start anew in a resumed run")
+    assert all(f"Warning: {part}" in error for part in parts)
+    assert re.findall(r"iteration (\d) of 2", output)[-1] == "2" and runner.logger.tot_timesteps == 2 * 4 * WORLDS
+    files = {path.name for path in folder.glob("*.pt*") if path.is_file()}
+    assert files == {"model_0.pt", "model_1.pt", "worlds_1.pt", "model_2.pt"}  # the last worlds stay with theirs
     start(None, "--resume", f"--load_run={runner.log_dir}")
     assert "The worlds start anew" in capsys.readouterr().out
-
-
-def test_an_evaluation_that_cannot_be_written(tmp_path, capsys):
-    """Training goes on and leaves its checkpoint."""
-    runner = start(tmp_path)
-    runner.claim_log_dir({})
-    (Path(runner.log_dir) / "evaluations.csv").mkdir()
-    runner.learn(1)
-    assert "Warning: an evaluation is not kept: cannot write '" in capsys.readouterr().err
-    assert (Path(runner.log_dir) / "model_1.pt").is_file()

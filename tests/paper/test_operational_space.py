@@ -107,9 +107,6 @@ def random_torques(seed):
     return 10.0 * torch.randn(6, 12, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-# --------------------------------------------------------------------------------------------------- dynamics
-
-
 def test_dynamics_matches_mujoco(model):
     """All quantities agree with plain MuJoCo's to single precision; every foot is carried by its own leg's joints."""
     qpos, qvel = random_states(model, 8, seed=3)
@@ -132,9 +129,6 @@ def test_robots_without_these_formulas(model):
     fixed = "<mujoco><worldbody><body><joint/><geom name='foot' size='0.1'/></body></worldbody></mujoco>"
     with pytest.raises(UserError, match="free trunk"):
         RobotDynamics(mujoco.MjModel.from_xml_string(fixed), 1, "cpu", ["foot"])
-
-
-# --------------------------------------------------------------------------------------------------- contacts
 
 
 @pytest.mark.parametrize("mask", MASKS)

@@ -83,9 +83,6 @@ def page(report):
     return Page((report / "report.html").read_text())
 
 
-# ------------------------------------------------------------------------------------------------ tables and text
-
-
 def test_table(report):
     """One row per task, column and metric, with the paper's value and nothing where there is nothing."""
     table = rows_of((report / "table.csv").read_bytes())
@@ -205,17 +202,11 @@ def test_mistakes(tmp_path, capsys, plan, words, message):
     assert not (tmp_path / "out").exists()
 
 
-# -------------------------------------------------------------------------------------------------------- figures
-
-
 def test_running_medians():
     """A single outlier vanishes; at the ends the window holds fewer evaluations; nothing is drawn beyond an end."""
     curves = pd.DataFrame({1: [1.0, 9.0, 2.0, 3.0], 2: [1.0, 1.0, None, None]}, index=[0.0, 1.0, 2.0, 3.0])
     medians = smoothed(curves, 2.0)
     assert medians[1].tolist() == [5.0, 2.0, 3.0, 2.5] and medians[2].isna().tolist() == [False, False, True, True]
-
-
-# ----------------------------------------------------------------------------------------------------------- page
 
 
 def test_tables_of_the_page(text, page):

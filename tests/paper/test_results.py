@@ -24,9 +24,6 @@ def evaluations(*millions):
     return pd.DataFrame({"steps": [1_000_000 * million for million in millions]})
 
 
-# ----------------------------------------------------------------------------------------------------- reading
-
-
 def test_rows_of_a_run(tmp_path):
     """Empty, nan and inf cells are NaN, a cut-off last line is left out, other unreadable lines are named."""
     file, problems = tmp_path / "evaluations.csv", []
@@ -99,9 +96,6 @@ def test_broken_files(tmp_path):
     assert cells["values"]["track_percentage"] == pytest.approx([0.7, 0.6])
     assert len(cells["values"]["height"]) == 1 and not cells["is_final"]["height"]
     assert cells["values"]["track_xy"] == pytest.approx([7.0, 4.0]) and cells["is_final"]["track_xy"]
-
-
-# -------------------------------------------------------------------------------------------------- statistics
 
 
 def test_welch_by_hand():

@@ -52,9 +52,6 @@ def test_standing_refuses(made, tmp_path):
     assert_told_in_one_line(result, "--num_steps is for making a policy, which --check_standing does not do")
 
 
-# -------------------------------------------------------------------------------------------------------- plot.py
-
-
 def plot(figure, file, folder, name="picture.png"):
     """Draw a figure of a file; return the result and the picture's path, in a folder that is not there yet."""
     picture = folder / "new" / name

@@ -51,9 +51,6 @@ def state(task):
     return task.sim.qpos.clone(), task.sim.qvel.clone()
 
 
-# --------------------------------------------------------------------------------------------------- torques
-
-
 def test_torques_and_contact_forces_hold_the_robot(task, state):
     """On four feet at rest, clipped torques and contact forces balance gravity as mj_inverse says."""
     qpos, qvel = state[0].clone(), torch.zeros_like(state[1])
@@ -87,9 +84,6 @@ def test_without_contact_only_posture_remains(task, state):
     assert (result.task == 0.0).all() and (result.force == 0.0).all()
     torch.testing.assert_close(result.total, (-1.0 * qvel[:, 6:]).clamp(-TORQUE_LIMIT, TORQUE_LIMIT), rtol=0, atol=1e-3)
     assert (make_controller(task, 16)(*state, nothing).total.abs() <= TORQUE_LIMIT).all()
-
-
-# --------------------------------------------------------------------------------------------------- standing
 
 
 def test_place_on_ground():

@@ -6,7 +6,7 @@ import re
 import pytest
 import torch
 from support.evaluations import note_steps
-from support.scripts import assert_told_in_one_line, contents, run_here
+from support.scripts import run_here
 from torch.nn.functional import elu, linear
 
 from legged_torque.utils.metrics import UNITS
@@ -90,24 +90,3 @@ def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
         place = rf"{row['kind']} +{row['level']:g} +2 +0.000 \+- 0.000 +{row['fell']['mean']:.3f} "
         assert re.search(rf"(?m)^  {place}", output), row
     assert "8 worlds, commanded to walk 2 0 m/s for 4.0 s at most:" in output
-
-
-MISTAKES = {
-    "--terrain stairs_pu": "unknown kind of terrain 'stairs_pu'; did you mean 'stairs_up'?",
-    "--terrain flat --level 0.5 1.01": "a level must be from 0 to 1, not 1.01",
-    "--terrain flat --level nan": "a level must be from 0 to 1, not nan",
-    "--terrain flat --command 0 0 0": "the command must have a speed of 0.1 m/s or more and a yaw rate of 0, not 0 0 0",
-    "--terrain flat --steps=5": "--steps is not for --terrain",
-    "--level 0.5": "--level needs --terrain",
-    "--terrain flat --level 0 --set terrain.measure_heights=true": "does not fit this task",
-    "--steps=0": "--steps must be at least 1, not 0",
-}
-
-
-@pytest.mark.parametrize(("words", "message"), MISTAKES.items())
-def test_mistakes(root, words, message):
-    """Exit status 2, one line that names the mistake, and nothing is written."""
-    before = contents(root)
-    result = run_here("evaluate.py", *TASK, f"--json={root / 'x.json'}", *words.split(), root=root)
-    assert_told_in_one_line(result, message)
-    assert contents(root) == before

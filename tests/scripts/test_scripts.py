@@ -11,7 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
 import torch
 import yaml
 from support.scripts import ROOT, SMALL, run_here
@@ -88,15 +87,13 @@ def test_nobody_reads_on(tmp_path):
     process.stderr.close()
 
 
-@pytest.mark.parametrize("after", [0.0, 0.8])
-def test_interrupt_while_starting(tmp_path, after):
+def test_interrupt_while_starting(tmp_path):
     """Ctrl-C before anything runs ends a script by that signal, without a word."""
     process = start("train.py", *SMALL, root=tmp_path)
     seen = 0
     while seen < 3:  # and not just for a moment, before Python's own handler is there
         seen = seen + 1 if leaves_interrupts_alone(process.pid) else 0
         time.sleep(0.01)
-    time.sleep(after)
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
     assert (status, output, error) == (-signal.SIGINT, "", "") and not list(tmp_path.iterdir())
@@ -122,7 +119,8 @@ def test_train_stop_resume_play(tmp_path):
     assert any(line.startswith("Note: ") and "--preset laptop" in line for line in lines)  # this one takes hours
     process.send_signal(signal.SIGINT)
     status, output, error = finish(process)
-    assert status == 130 and "Traceback" not in error and "Stopping" in output + error
+    assert status == 130 and "Stopping" in output + error
+    assert "Traceback" not in error and "leak" not in error  # as Triton, which torch imports, might say in the end
     (first,) = logs.iterdir()
     beginning, count = checkpoint_numbers(first)
     assert beginning == 0

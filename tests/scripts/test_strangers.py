@@ -124,15 +124,6 @@ def test_checkpoint_of_nothing_but_lists(run, script):
         assert_told_in_one_line(load_run(script, run), "model_1.pt'")
 
 
-def test_checkpoint_that_runs_code_on_the_page(run, harm):
-    """The viewer's page refuses it as well, and is never opened."""
-    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
-    torch.save({"payload": Payload(harm)}, run / "model_1.pt")
-    assert_told_in_one_line(load_run("play.py", run, "--viewer=web"), "is not a readable checkpoint")
-    edit_config(run, actor__class_name="payload:run")
-    assert_told_in_one_line(load_run("play.py", run, "--viewer=web"), "unknown actor.class_name")
-
-
 def test_checkpoint_for_a_runner_of_rsl_rl(run, harm):
     """A user's task may train with rsl_rl's own runner, whose ``load`` would run what a file holds."""
     registry = TaskRegistry()

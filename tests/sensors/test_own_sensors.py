@@ -12,8 +12,6 @@ from legged_torque.sensors.config import SensorCfg
 from legged_torque.sensors.sensor import Sensor
 from legged_torque.utils.math import quat_rotate_yaw
 
-# ------------------------------------------------------------------------------------------------ a user's own file
-
 
 class DownwardRayCfg(SensorCfg):
     """Settings of rays that point down."""
@@ -102,9 +100,6 @@ def make(num_envs=4, **changes):
         setattr(cfg.sensors.ray, name, value)
     torch.manual_seed(0)
     return RayRobot(cfg)
-
-
-# ------------------------------------------------------------------------------------------------ what it does
 
 
 def expected_rays(task):

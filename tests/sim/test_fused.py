@@ -7,7 +7,6 @@ import torch
 from support.fused import (
     AIR,
     DEEP,
-    FIELDS,
     FLOOR,
     ROBOTS,
     assert_alike,
@@ -15,15 +14,12 @@ from support.fused import (
     draw_states,
     invariants,
     make_a1,
-    put,
     random,
     step_fused,
     step_mujoco,
 )
 
 from legged_torque.sim.registry import make_engine
-
-# --------------------------------------------------------------------------------------------------- one step
 
 
 @pytest.mark.parametrize("heights", [AIR, FLOOR, DEEP], ids=["air", "floor", "deep"])
@@ -35,10 +31,8 @@ def test_matches_plain_mujoco(robot, heights):
     expected = step_mujoco(model, states)
     share = (expected[2] > 0).any(axis=1).mean()
     assert share == 0.0 if heights == AIR else share > 0.3
-    assert_alike(model, states, step_fused(model, states), expected)
-
-
-# --------------------------------------------------------------------------------------------------- many steps
+    actual = step_fused(model, states, with_forces=robot == "crab")  # whose kernel EngineSuite needs as well
+    assert_alike(model, states, actual, expected)
 
 
 def test_conservation_in_the_air():
@@ -67,9 +61,6 @@ def test_conservation_in_the_air():
     np.testing.assert_allclose(actual[:, 1:], expected[:, 1:], rtol=0, atol=2e-4)
 
 
-# --------------------------------------------------------------------------------------------------- the solver
-
-
 def test_limits_of_the_solver():
     """With one iteration the answer is worse but finite, and the more, the better it gets."""
     model = compiled(make_a1())
@@ -93,26 +84,3 @@ def test_warm_start_does_not_matter(scale):
     expected = step_mujoco(model, states)
     states["qacc_warmstart"] = scale * random(states["qvel"].shape, -1.0, 1.0)
     assert_alike(model, states, step_fused(model, states), expected, worst=5e-3, median=5e-5)
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
-@pytest.mark.parametrize("field", FIELDS)
-def test_bad_numbers_stay_in_their_world(field, value):
-    """A world with a number that is none, or absurd, leaves the others bitwise alone, and can be reset."""
-    model = compiled(make_a1())
-    states = draw_states(model, 4)
-    sims = [make_engine("fused", model, 4, "cpu") for _ in range(2)]
-    for sim in sims:
-        put(sim, states)
-    getattr(sims[0], field)[1, -1] = value
-    for _ in range(3):
-        for sim in sims:
-            sim.step()
-    for name in (*FIELDS, "contact_found", "contact_force"):
-        bad, good = getattr(sims[0], name), getattr(sims[1], name)
-        for world in (0, 2, 3):
-            assert torch.equal(bad[world], good[world]), name
-    for sim in sims:
-        sim.reset(torch.tensor([False, True, False, False]))
-        sim.step()
-    assert torch.isfinite(sims[0].qvel).all() and torch.equal(sims[0].qvel, sims[1].qvel)

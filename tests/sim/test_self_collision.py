@@ -6,6 +6,7 @@ import pytest
 import torch
 from support.fused import assert_alike, put, step_fused, step_mujoco
 from support.on_device import assert_matches
+from support.published import read_robot
 from support.settings import error_of
 
 from legged_torque.envs.base.asset import load_asset
@@ -16,33 +17,11 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import self_pairs
 
 GEOM = mujoco.mjtGeom
-ROBOT = """<mujoco><compiler angle="radian" autolimits="true"/>
-<option cone="pyramidal" integrator="implicitfast" impratio="10" timestep="0.004"/>
-<default><joint axis="0 1 0" armature="0.02" frictionloss="0.1" damping="0.3" range="-1.5 1.5"/>
-<geom contype="2" conaffinity="3" friction="0.6"/><motor ctrlrange="-20 20" forcerange="-15 15"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" friction="0.7"/>
-<body name="trunk" pos="0 0 0.3"><freejoint/>
- <geom name="hull" type="box" size="0.12 0.05 0.03" mass="4" solref="0.03 0.9" solmix="3"/>
- <geom name="head" type="sphere" size="0.05" pos="0.14 0 -0.02" mass="1" priority="1" friction="0.3"/>{legs}
- <body name="tail" pos="-0.14 0 0.02"><joint name="tail" axis="0 1 0.2"/>
-  <geom name="tail" type="capsule" size="0.015" fromto="0 0 0 0.02 0 -0.15" mass="0.3" solimp="0.5 0.9 0.01 0.5 2"/>
- </body></body></worldbody><actuator>{motors}</actuator><contact>{pairs}</contact></mujoco>"""
-LEG = """<body name="{s}thigh" pos="{x} 0 -0.05"><joint name="{s}1"/>
- <geom name="{s}thigh" type="capsule" size="0.02" fromto="0 0.01 0 0 -0.01 -0.12" mass="0.6" solref="-900 -60"/>
- <body name="{s}shin" pos="0 {y} -0.13"><joint name="{s}2" axis="1 0.4 0" range="-2.4 2.4"/>
-  <geom name="{s}shin" type="box" size="0.03 0.02 0.05" pos="0 0 -0.05" mass="0.3" solmix="0.5" solref="0.01 1.2"/>
-  <geom name="{s}foot" type="sphere" size="0.03" pos="0 0 -0.12" mass="0.2" friction="1.1" solref="-700 -50"/>
- </body></body>"""
-PAIR = '<pair geom1="{}" geom2="{}" condim="3" friction="0.4 0.4" solref="{}" solimp="0.6 0.9 0.02 0.5 2"/>'
-PAIRS = PAIR.format("hull", "Fshin", "-800 -50") + PAIR.format("Ffoot", "Rshin", "0.03 1.1")
-PARTS = (("F", 0.06, 0.02), ("R", -0.06, -0.02))
-LEGS = "".join(LEG.format(s=side, x=x, y=y) for side, x, y in PARTS)
-MOTORS = "".join(f'<motor joint="{joint}"/>' for joint in ("F1", "F2", "R1", "R2", "tail"))
 
 
 def make_spec(edit=None):
     """The specification of a robot with two legs of two joints and a tail of one, all parts of which may collide."""
-    spec = mujoco.MjSpec.from_string(ROBOT.format(legs=LEGS, motors=MOTORS, pairs=PAIRS))
+    spec = read_robot("folding")
     if edit is not None:
         edit(spec)
     return spec
@@ -146,9 +125,6 @@ def test_too_many_contacts_are_reported():
         assert torch.isfinite(sim.qvel).all()
         said = sim.check_buffers()
         assert said is None if warning is None else warning in said
-
-
-# ------------------------------------------------------------------------------------------------------ the option
 
 
 def settings_of(file, on):

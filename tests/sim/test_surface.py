@@ -14,8 +14,6 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 
-# --------------------------------------------------------------------------------------------------- the surface
-
 
 @wp.kernel(enable_backward=False)
 def touch_all(
@@ -88,9 +86,6 @@ def test_triangles_of_a_plane_are_one_plane(slope):
     np.testing.assert_allclose(touch["first"][touching], np.tile(normal, (touching.sum(), 1)), rtol=0, atol=2e-6)
 
 
-# ---------------------------------------------------------------------------------------------------
-
-
 def circle_point(radius, eighth):
     """A point of a circle around the origin."""
     return radius * np.cos(np.pi / 4 * eighth), radius * np.sin(np.pi / 4 * eighth)
@@ -98,8 +93,7 @@ def circle_point(radius, eighth):
 
 @pytest.mark.parametrize("ground", [stairs, pits, rough])
 @pytest.mark.parametrize(
-    ("kind", "size"),
-    [("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")],
+    ("kind", "size"), [("capsule", "0.03 0.1"), ("cylinder", "0.06 0.05"), ("box", "0.1 0.06 0.04")]
 )
 def test_nothing_falls_through(kind, size, ground):
     """What hits stairs, pits and rough ground at 5 m/s, straight or aslant, comes to lie on it and wins no energy."""

@@ -1,7 +1,6 @@
 """A physics engine of a user's, in one file: plain MuJoCo on a CPU, one world after another."""
 
 import mujoco
-import numpy as np
 import pytest
 import torch
 from support.engine_suite import EngineSuite
@@ -84,29 +83,6 @@ def test_training(tmp_path):
     status, _, error = run_here("train.py", *WORDS, "--max_iterations=2", root=tmp_path)
     assert status == 0, error
     assert len(list(tmp_path.glob("logs/*/*/model_2.pt"))) == 1
-
-
-def test_a_task_moves_as_mujoco(make_task):
-    """A control step is as many calls of ``mj_step``, under the torques of the task."""
-    task = make_task("a1_multihead", 2, **{"sim.engine": "mujoco"})
-    data = mujoco.MjData(task.sim.mj_model)
-    start = {name: values.clone() for name, values in task.sim.state_dict().items()}
-    torques, step = [], task.sim.step
-
-    def noted_step(sense):
-        torques.append(task.torques[1].clone())
-        step(sense)
-
-    task.sim.step = noted_step
-    task.step(torch.randn(2, task.num_actions))
-    for name in STATE:
-        getattr(data, name)[:] = start[name][1]
-    for torque in torques:
-        data.ctrl[:] = torque
-        mujoco.mj_step(task.sim.mj_model, data)
-    assert len(torques) == task.cfg.control.decimation
-    np.testing.assert_allclose(task.sim.qpos[1], data.qpos, rtol=0, atol=1e-5)
-    np.testing.assert_allclose(task.sim.qvel[1], data.qvel, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -62,8 +62,6 @@ class EngineSuite:
         sim.qvel.copy_(0.3 * torch.randn(num_envs, 18, generator=generator))
         return sim
 
-    # ---- physics -----------------------------------------------------------------------------------------------------
-
     @pytest.mark.parametrize(("resync", "looser"), [(1, 1.0), (5, 3.0)])
     def test_matches_plain_mujoco(self, resync, looser):
         """Over 200 steps of random torques every world moves as plain MuJoCo does from the same state.
@@ -113,8 +111,6 @@ class EngineSuite:
             assert touched > 5
         assert not torch.equal(trajectories[0][0], trajectories[1][0])
         assert torch.equal(trajectories[0][1], trajectories[1][1]) and torch.equal(*[t[1] for t in trajectories[1:]])
-
-    # ---- contact sensors ---------------------------------------------------------------------------------------------
 
     def test_standing_robot_presses_its_weight(self):
         """Forces on the feet of a standing robot sum up to its weight; other parts and one in the air feel nothing."""
@@ -167,8 +163,6 @@ class EngineSuite:
             assert sims[0].contact_force.any()
             if sense:
                 assert torch.equal(sims[0].contact_force, sims[1].contact_force)
-
-    # ---- resets, divergence, state -----------------------------------------------------------------------------------
 
     @pytest.mark.parametrize("worlds", [[0], [1, 3], [0, 1, 2, 3]])
     def test_reset_touches_only_masked_worlds(self, worlds):
@@ -270,8 +264,6 @@ class EngineSuite:
         assert not torch.equal(first.qpos, kept["qpos"])
         with pytest.raises(UserError, match="does not fit the engine: qpos"):
             second.load_state_dict(kept | {"qpos": kept["qpos"][:, :-1]})
-
-    # ---- capabilities ------------------------------------------------------------------------------------------------
 
     @pytest.mark.parametrize("capability", USES)
     def test_what_lacks_is_refused(self, capability):

@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import torch
+from support.published import read_robot
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model
@@ -12,54 +13,6 @@ from legged_torque.utils.mjcf import colliding_pairs, read_spec
 FIELDS = ("qpos", "qvel", "ctrl", "qacc_warmstart")
 AIR, FLOOR, DEEP = (1.0, 2.0), (0.05, 0.3), (-0.4, 0.1)
 """Heights of the trunk [m]: out of reach of the floor, on it, in it."""
-WALKER = """<mujoco><compiler angle="radian" autolimits="true"/>
-<option cone="pyramidal" integrator="implicitfast" impratio="10" timestep="0.004"/>
-<default><joint armature="0.02" frictionloss="0.1" damping="0.3" stiffness="4" springref="0.2" range="-1 1"/>
-<geom contype="0" conaffinity="1"/><motor ctrlrange="-20 20" forcerange="-15 15"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" friction="0.7"/>
-<body name="trunk" pos="0.1 0.2 0.3" quat="1 0.1 0.2 0.3"><freejoint/>
- <geom name="hull" type="capsule" size="0.06 0.1" quat="1 1 0.1 0" mass="4"/>
- <geom name="tail" type="sphere" size="0.05" pos="-0.1 0 0.02" mass="1"/>
- <geom name="nose" type="box" size="0.03 0.04 0.02" pos="0.12 0 0" quat="1 0 0.3 0" mass="0.5"/>{legs}</body>
-</worldbody><actuator>{motors}</actuator></mujoco>"""
-WALKER_LEG = """<body pos="0 {y} -0.05" quat="1 0.2 0 {y}">
- <joint name="{s}1" axis="1 0 0.2" pos="0.01 0.02 0.03"/><geom name="{s}hip" type="sphere" size="0.03" mass="0.5"/>
- <body pos="0.02 0 -0.04" quat="1 0 -0.3 0"><joint name="{s}2" axis="0.1 1 0" pos="0 0 0.02" ref="0.1"/>
-  <geom name="{s}thigh" type="capsule" size="0.02" fromto="0 0 0 0.02 0 -0.12" mass="0.4"/>
-  <body pos="0.02 0 -0.13"><joint name="{s}3" axis="0 1 0" damping="0"/>
-   <geom name="{s}shin" type="capsule" size="0.015" fromto="0 0 0 0 0 -0.1" mass="0.2"/>
-   <body pos="0 0 -0.12" quat="1 0 0.2 0.1"><joint name="{s}4" axis="0.3 1 0.5" frictionloss="0" pos="0 0 -0.01"/>
-    <geom name="{s}foot" type="box" size="0.05 0.03 0.015" pos="0.02 0 -0.01" quat="1 0.1 0 0" mass="0.3"/>
- </body></body></body></body>"""
-CRAB = """<mujoco><compiler angle="radian" autolimits="true"/>
-<option cone="pyramidal" integrator="Euler" impratio="10" timestep="0.004">
- <flag midphase="disable" autoreset="disable" fwdinv="enable" invdiscrete="enable"/></option>
-<default><joint armature="0.01" frictionloss="0.1" damping="0.5" range="-0.8 0.6"/><motor ctrlrange="-9 9"/>
- <geom contype="0" conaffinity="1" condim="1"/></default>
-<worldbody><geom name="floor" type="plane" size="0 0 1" contype="1" conaffinity="0" condim="3" solref="0.015 0.9"/>
-<body name="trunk" pos="0 0 0.3"><freejoint/><geom name="drum" type="cylinder" size="0.1 0.04" mass="3"/>
- <geom name="box" type="box" size="0.15 0.06 0.02" mass="1"/>
- <body name="head" pos="0.1 0 0.05" euler="0 0.4 0">
-  <geom name="head" type="cylinder" size="0.03 0.05" mass="0.5"/></body>
- <body name="wheel" pos="0.1 0.1 -0.05"><joint axis="0 1 0.1" name="wheel" limited="false"/>
-  <geom name="tyre" type="cylinder" size="0.07 0.02" euler="1.57 0.1 0" mass="0.6"/></body>
- <body name="tail" pos="-0.1 0 0" euler="0 0 0.3"><joint axis="0 1 0"/>
-  <geom name="tail" type="capsule" size="0.02" fromto="0 0 0 -0.1 0 0" mass="0.3"/>
-  <body pos="-0.1 0 0"><joint axis="0 0.2 1" limited="false" damping="0"/>
-   <geom name="tip" type="box" size="0.03 0.02 0.01" pos="-0.04 0 0" mass="0.2"/></body></body>
- <body pos="0.05 -0.1 -0.02"><joint name="leg1" axis="1 0 0"/>
-  <geom name="ghost" size="0.2" conaffinity="4" condim="6" margin="0.1" mass="0.3"/>
-  <body pos="0 -0.02 -0.03"><joint name="leg2" axis="0 1 0.1"/>
-   <geom name="thigh" type="capsule" size="0.02" fromto="0 0 0 0.02 0 -0.12" mass="0.4"/>
-   <body name="ankle" pos="0.02 0 -0.12" euler="0.2 0 0.1">
-    <body pos="0 0 -0.02"><joint name="leg3" axis="0 1 0"/><geom name="shin" size="0.02" mass="0.2"/>
-     <body name="foot" pos="0 0 -0.08" euler="0 0.1 0.2">
-      <geom name="foot" type="cylinder" size="0.04 0.01" mass="0.1"/></body>
- </body></body></body></body>{legs}</body></worldbody><actuator>
- <motor joint="leg2" ctrllimited="false"/><motor joint="wheel" forcerange="-3 2"/><motor joint="leg3"/>
- <motor joint="leg1" gear="2"/></actuator></mujoco>"""
-CRAB_LEG = """<body pos="{x} 0.1 0" euler="0 0 {x}"><joint axis="0.2 -1 0" pos="0.01 0 0"/>
-<geom name="leg{x}" type="capsule" size="0.015 0.05" pos="0.08 0 -0.05" mass="0.2"/></body>"""
 
 
 def make_a1(edit=None):
@@ -72,9 +25,7 @@ def make_a1(edit=None):
 
 def make_walker():
     """Two legs with four joints each, off their bodies' origins and about odd axes; one joint has no motor."""
-    legs = "".join(WALKER_LEG.format(s=side, y=y) for side, y in (("L", 0.08), ("R", -0.08)))
-    motors = "".join(f'<motor joint="{joint}" gear="1.5"/>' for joint in ("R2", "R1", "L4", "L1", "L2", "R4", "L3"))
-    return mujoco.MjSpec.from_string(WALKER.format(legs=legs, motors=motors))
+    return read_robot("walker")
 
 
 def make_crab():
@@ -82,7 +33,7 @@ def make_crab():
 
     Its settings differ from those of the fused step, but change no motion, and one geom passes through the floor.
     """
-    return mujoco.MjSpec.from_string(CRAB.format(legs="".join(CRAB_LEG.format(x=x) for x in (-0.1, 0.0))))
+    return read_robot("crab")
 
 
 ROBOTS = {"a1": make_a1, "walker": make_walker, "crab": make_crab}
@@ -154,9 +105,11 @@ def spoil(sim):
         array.numpy().reshape(-1).view(np.float32).fill(np.inf)
 
 
-def step_fused(model, states, iterations=100, ls_iterations=50, height_map=None):
-    """The same after one fused step."""
+def step_fused(model, states, iterations=100, ls_iterations=50, height_map=None, with_forces=False):
+    """The same after one fused step, maybe with the kernel that also reads applied forces."""
     sim = make_engine("fused", model, len(states["qpos"]), "cpu", iterations, ls_iterations, height_map)
+    if with_forces:
+        sim.applied_forces()
     spoil(sim)
     put(sim, states)
     sim.step()

@@ -35,12 +35,18 @@ def start(root, *words):
     return runner
 
 
-def train(root, iterations, *words):
-    """Train from the start, and return the runner."""
+def begin(root, *words):
+    """The runner of a new run."""
     runner = start(root, *words)
     options = parse(*WORDS, *words)
     env_cfg, train_cfg = map(to_dict, task_registry.get_cfgs(options.task, options))
     runner.claim_log_dir({"task": options.task, "env": env_cfg, "train": train_cfg})
+    return runner
+
+
+def train(root, iterations, *words):
+    """Train from the start, and return the runner."""
+    runner = begin(root, *words)
     runner.learn(iterations, init_at_random_ep_len=True)
     return runner
 

@@ -55,4 +55,4 @@ def running(session):
     thread.start()
     yield session
     session.stop()
-    thread.join(timeout=10)
+    thread.join(timeout=120)

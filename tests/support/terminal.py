@@ -24,7 +24,12 @@ def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables)
     environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
     environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
     streams = {"stdin": slave, "stdout": slave, "stderr": slave}
-    process = subprocess.Popen([sys.executable, "-c", code], **streams, env=environment, start_new_session=True)
+    how = {
+        "env": environment,
+        "start_new_session": True,
+        "preexec_fn": lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
+    }
+    process = subprocess.Popen([sys.executable, "-c", code], **streams, **how)
     os.close(slave)
     output = b""
     with contextlib.suppress(OSError):  # at the end of a terminal
@@ -36,4 +41,4 @@ def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables)
                 process.send_signal(signal.SIGINT)
                 after = ""
     os.close(master)
-    return process.wait(20), output.decode()
+    return process.wait(120), output.decode()

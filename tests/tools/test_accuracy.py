@@ -11,14 +11,7 @@ from support.scripts import SMALL, run_here
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.registry import ENGINES, make_engine
-from tools.accuracy import (
-    KINDS,
-    copy_state,
-    make_states,
-    measure_accuracy,
-    open_motors,
-    reference_step,
-)
+from tools.accuracy import KINDS, copy_state, make_states, measure_accuracy, open_motors, reference_step
 
 WORLDS = 120
 SETTINGS = (LeggedRobotCfg.sim.solver_iterations, LeggedRobotCfg.sim.ls_iterations)

@@ -1,7 +1,6 @@
 """FLOP and bytes of update and physics: as PyTorch counts them, and as counted by hand."""
 
 import pytest
-from support.scripts import run_here
 from torch.utils.flop_counter import FlopCounterMode
 
 from legged_torque.envs import task_registry
@@ -44,14 +43,3 @@ def test_flop_as_pytorch_counts_them(tmp_path, task, changes):
     with FlopCounterMode(display=False) as counter:
         alg.update()
     assert roofline.update_flop(alg) == counter.get_total_flops() > 0
-
-
-def test_script(tmp_path):
-    """It prints three rates with their peaks, each share being the one over the other."""
-    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--rounds=1", "--set=runner.num_steps_per_env=3"]
-    status, output, error = run_here("../tools/roofline.py", *words, root=tmp_path)
-    rates = [line.replace(",", "").split() for line in output.splitlines()[1:]]
-    assert (status, error) == (0, "") and [words[0] for words in rates] == ["update", "update", "physics"]
-    assert {words[4] for words in rates} == {"GFLOP/s:", "GB/s:"} and not list(tmp_path.iterdir())
-    for words in rates:
-        assert float(words[5].strip("%")) == pytest.approx(100 * float(words[1]) / float(words[3]), abs=1.0)

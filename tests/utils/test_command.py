@@ -99,9 +99,6 @@ def test_help_has_examples(script, tmp_path):
         assert head.index("\n  --task TASK") < head.index("\n  --set KEY=VALUE") < head.index("\noptions:\n")
 
 
-# ---- flags of legged_gym ---------------------------------------------------------------------------------------------
-
-
 def test_last_run_and_checkpoint():
     """-1 is the last one; so it is nothing that needs --resume."""
     options = parse("--load_run=-1", "--checkpoint=-1")

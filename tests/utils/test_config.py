@@ -4,12 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import yaml
 from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import section_keys, to_dict
-from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.task_registry import num_iterations
 
 
@@ -57,8 +55,6 @@ def test_bad_overrides(item, message):
     """One line names the entry, what it takes and what was given."""
     assert message in error_of(get_cfgs, f"--set={item}")
 
-
-# ---- presets and precedence ------------------------------------------------------------------------------------------
 
 TABLE_II = {
     "algorithm.learning_rate": 1e-4,
@@ -122,10 +118,3 @@ def test_number_of_worlds_suits_the_device(monkeypatch):
     args = parse()
     args.device = "auto"
     assert task_registry.get_cfgs("a1_position", args)[0].env.num_envs == 4096
-
-
-def test_text_that_looks_like_a_number_is_written_as_text():
-    """What a run writes is read again as it was, by any version of YAML."""
-    values = ["017", "09", "1e-4", "1:30", "on", "null", "", ".nan", "2026-01-01", 1e-5, 1e30, True, None, 5, "a: b"]
-    text = yaml.dump(values, Dumper=Dumper)
-    assert parse_yaml(text, "the text") == values == yaml.safe_load(text)

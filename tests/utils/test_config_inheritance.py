@@ -63,12 +63,7 @@ class Reverse(Robot, Approach):
 def test_sections_of_several_bases_combine():
     """Each base contributes what it says, at every depth; the first base wins, and gives the order of entries."""
     assert to_dict(Both()) == {
-        "control": {
-            "stiffness": 20.0,
-            "damping": 9.0,
-            "mixing": {"start": 30.0, "end": 40.0},
-            "ramp": {"time": 0.5},
-        },
+        "control": {"stiffness": 20.0, "damping": 9.0, "mixing": {"start": 30.0, "end": 40.0}, "ramp": {"time": 0.5}},
         "rewards": {"scale": 8.0, "temperature": 7.0},
     }
     assert list(to_dict(Both())["control"]) == ["stiffness", "damping", "mixing", "ramp"]

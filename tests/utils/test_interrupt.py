@@ -57,16 +57,6 @@ def test_under_nohup():
     assert not stop.requested
 
 
-def test_nothing_is_called_a_leak():
-    """Triton, which torch imports where it is installed, has nothing to say when a script ends."""
-    pytest.importorskip("triton", reason="triton is not installed")
-    code = "def main():\n  with cli.slow_imports():\n    import triton\n"
-    code = f"from legged_torque.utils import cli\n{code}cli.run_script(main)"
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-
-
 def test_mujoco_leaves_no_file(tmp_path):
     """Its warnings go to standard error."""
     code = """

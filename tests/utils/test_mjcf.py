@@ -21,12 +21,7 @@ def tree(text):
 
 @pytest.mark.parametrize(
     ("text", "chains"),
-    [
-        ("t", []),
-        ("ta)b)", ["a", "b"]),
-        ("ta(b(c)))d(e))", ["abc", "de"]),
-        ("ts(a(b))c(d)))e)", ["sab", "scd", "e"]),
-    ],
+    [("t", []), ("ta)b)", ["a", "b"]), ("ta(b(c)))d(e))", ["abc", "de"]), ("ts(a(b))c(d)))e)", ["sab", "scd", "e"])],
 )
 def test_body_chains(text, chains):
     """There is a chain for each end of the tree, in the file's order; chains share bodies above a branch."""

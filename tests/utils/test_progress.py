@@ -2,10 +2,10 @@
 
 import io
 import os
-import time
 
 import pytest
 import warp as wp
+from support.clock import wait_for
 
 from legged_torque.utils.progress import COMPILING, CompileProgress, torch_compiles
 
@@ -57,7 +57,4 @@ def test_the_thread(cache):
     """It looks by itself while the context is open."""
     with CompileProgress(io.StringIO()) as progress:
         (cache / f"wp_a{OURS}").mkdir()
-        deadline = time.monotonic() + 20.0
-        while not progress.modules and time.monotonic() < deadline:
-            time.sleep(0.05)
-    assert progress.modules == {"wp_a"}
+        assert wait_for(lambda: progress.modules) == {"wp_a"}

@@ -74,7 +74,7 @@ def test_only_choices_count(monkeypatch, capfd, caplog, recwarn):
 
 def get(port, path="/", **headers):
     """Ask for the page; return the status, and the cookie that comes with it."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
     connection.request("GET", path, headers=headers)
     response = connection.getresponse()
     assert (response.status == 403) == (b"<html" not in response.read())
@@ -85,7 +85,7 @@ def get(port, path="/", **headers):
 def connects(port, host="127.0.0.1", origin=None, cookie=None):
     """Whether the page's own connection is let in, of a page that was opened at ``host``, whatever that leads to."""
     headers = {"Cookie": cookie} if cookie else {}
-    sock = socket.create_connection(("127.0.0.1", port), timeout=10)
+    sock = socket.create_connection(("127.0.0.1", port), timeout=120)
     try:
         with connect(
             f"ws://{host}:{port}", sock=sock, origin=origin, additional_headers=headers, subprotocols=[PROTOCOL]

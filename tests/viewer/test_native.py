@@ -1,16 +1,11 @@
 """MuJoCo's own window, and messages where it or the page cannot be shown."""
 
-import argparse
-import runpy
-import sys
 from unittest.mock import MagicMock
 
 import mujoco
 import pytest
 from support.sessions import new_session
 
-from legged_torque import SCRIPTS_DIR
-from legged_torque.utils.errors import UserError
 from legged_torque.viewer import native
 from legged_torque.viewer.drawing import Drawing
 
@@ -53,15 +48,3 @@ def test_what_is_drawn(session):
     assert window.user_scn.geoms[0].type == mujoco.mjtGeom.mjGEOM_ARROW
     ((_, _, _, numbers),) = window.set_texts.call_args.args
     assert numbers.split("\n")[1].startswith("+0.50 ")
-
-
-def test_missing_extra(monkeypatch):
-    """Without the page's extra, one line names it."""
-    monkeypatch.setenv("MUJOCO_GL", "disable")  # given back afterwards: play.py chooses another one
-    monkeypatch.setitem(sys.modules, "viser", None)
-    for name in [name for name in sys.modules if name.startswith("legged_torque.viewer.")]:
-        monkeypatch.delitem(sys.modules, name)
-    play = runpy.run_path(str(SCRIPTS_DIR / "play.py"))
-    args = argparse.Namespace(viewer="web", host="127.0.0.1", port=8080)
-    with pytest.raises(UserError, match=r"pip install 'legged_torque\[viewer\]'"):
-        play["import_viewer"](args, "a1_torque")

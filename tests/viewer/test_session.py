@@ -257,7 +257,7 @@ def test_requests_from_other_threads(make_session, monkeypatch):
         thread.join()
     wait_for(lambda: not session.requests)
     session.stop()
-    stepping.join(timeout=10)
+    stepping.join(timeout=120)
     assert not stepping.is_alive() and pushes == 30 * [stepping]
 
 

@@ -21,7 +21,7 @@ run = Path(words["load_run"])
 print(json.dumps([words, {name: os.environ.get(name) for name in ("RANK", "CUDA_VISIBLE_DEVICES")}]), flush=True)
 if "port" in words:
     (run / "page").write_text(str(os.getpid()))
-    time.sleep(60)
+    time.sleep(600)
 while not (run / "go").exists():
     time.sleep(0.01)
 if (run / "go").read_text() == "well":
@@ -95,7 +95,7 @@ def test_videos(run, capsys, outcome, warnings):
     shown = TrainingViewer(has_page=False, video_interval=100)
     show(shown, run, 0, 50, 100, 150)  # the video of the first one is not done yet
     (run / "go").write_text("well")
-    shown._video.wait(30.0)
+    shown._video.wait(120.0)
     (run / "go").write_text(outcome)
     show(shown, run, 200, 250)
     shown.close(is_waiting=True)
