@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
+from legged_torque.envs.base.flashsac_config import FlashSACCfg
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
@@ -30,6 +31,7 @@ from legged_torque.utils.limits import (
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
+FLASHSAC = "legged_torque.learning.flashsac:FlashSAC"
 
 
 class LeggedRobotCfg(BaseConfig):
@@ -380,6 +382,9 @@ class LeggedRobotCfgPPO(TrainingCfg):
             mirror_loss_coeff: NotNegative = 0.1  # weight of that loss
             data_augmentation_func: str = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them
 
+    class flashsac(FlashSACCfg):  # FlashSAC, the learner of the preset of that name
+        pass
+
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
         rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
@@ -388,4 +393,10 @@ class LeggedRobotCfgPPO(TrainingCfg):
         fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
         fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
-        return {"parallel": {}, "thorough": {"runner": {"total_steps": 330_000_000}}, "paper": table_ii}
+        flashsac = {
+            "env": {"num_envs": 1024, "num_envs_cpu": 1024},
+            "algorithm": {"class_name": FLASHSAC, "gamma": 0.99},
+        }
+        flashsac["runner"] = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
+        thorough = {"runner": {"total_steps": 330_000_000}}
+        return {"parallel": {}, "thorough": thorough, "paper": table_ii, "flashsac": flashsac}
