@@ -57,15 +57,19 @@ class UnitBatchNorm(nn.Module):
 
     def forward(self, x: Tensor, learning: bool) -> Tensor:
         """Normalize by the running statistics, or if it is ``learning`` by those of the batch, which they follow."""
-        mean, var = self.mean, self.var
+        centred, var = x - self.mean.unsqueeze(-2), self.var
         if learning:
-            var, mean = torch.var_mean(x, dim=-2, correction=0)
-            size = x.shape[-2]
-            with torch.no_grad():
-                self.mean.lerp_(mean, MOMENTUM)
-                self.var.lerp_(var * (size / (size - 1)), MOMENTUM)
-        factor = self.scale * torch.rsqrt(var + 1e-5)
-        return x * factor.unsqueeze(-2) + (self.shift - mean * factor).unsqueeze(-2)
+            mean = x.mean(dim=-2)
+            centred = x - mean.unsqueeze(-2)
+            var = centred.square().mean(dim=-2)
+            self._follow(mean.detach(), var.detach() * (x.shape[-2] / (x.shape[-2] - 1)))
+        return centred * (self.scale * torch.rsqrt(var + 1e-5)).unsqueeze(-2) + self.shift.unsqueeze(-2)
+
+    @torch.jit.unused
+    def _follow(self, mean: Tensor, var: Tensor) -> None:
+        """Move the running statistics towards those of a batch."""
+        self.mean.lerp_(mean, MOMENTUM)
+        self.var.lerp_(var, MOMENTUM)
 
     @torch.jit.unused
     def bound(self) -> None:
