@@ -1,9 +1,16 @@
 """Settings of FlashSAC, with the names of rsl_rl_flashsac and the published values for 1024 worlds."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
 
 from legged_torque.utils.config import Section
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Count, Fraction, Limits, Positive
+
+PPO, FLASHSAC = "legged_torque.learning.ppo:OnDevicePPO", "legged_torque.learning.flashsac:FlashSAC"
+UNREAD = {PPO: ("flashsac.",), FLASHSAC: ("algorithm.", "actor.", "critic.")}
+"""Beginnings of the paths of settings that a learner does not read, but for :data:`SHARED`."""
+SHARED = ("algorithm.class_name", "algorithm.gamma", "algorithm.symmetry_cfg.")
 
 
 class FlashSACCfg(Section):
@@ -25,7 +32,7 @@ class FlashSACCfg(Section):
     actor_noise_zeta_mu: Positive = 2.0  # noise is repeated for n steps with a probability in proportion to n^-mu
     actor_noise_zeta_max: Annotated[int, Limits(1, 1e6)] = 16  # the largest n
     normalized_g_max: Positive = 5.0  # largest return that the critic knows, in units of scaled rewards
-    action_bound: Positive = 4.0  # largest action, in units of control.action_scale and control.torque_scale; ours
+    action_bound: Positive = 2.0  # largest action, in the units of control.action_scale and control.torque_scale; ours
 
     class actor:  # the policy's network
         hidden_dim: Annotated[int, Limits(1, 1e6)] = 128  # size of its features
@@ -35,3 +42,18 @@ class FlashSACCfg(Section):
         hidden_dim: Annotated[int, Limits(1, 1e6)] = 256  # size of their features
         num_blocks: Annotated[int, Limits(1, 100)] = 2  # of two layers each
         num_bins: Annotated[int, Limits(2, 10_000)] = 101  # values of their distributions
+
+
+def preset() -> dict[str, dict[str, Any]]:
+    """Return the changes that choose FlashSAC as it was published, but with an update after 8 control steps, not 1."""
+    runner = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
+    worlds = {"num_envs": 1024, "num_envs_cpu": 1024}
+    return {"env": worlds, "runner": runner, "algorithm": {"class_name": FLASHSAC, "gamma": 0.99}}
+
+
+def refuse_unread(learner: str, paths: Iterable[str]) -> None:
+    """Refuse, by UserError, changes at ``paths`` that a learner of ours does not read; a user's may read everything."""
+    for path in paths:
+        if path.startswith(UNREAD.get(learner, ())) and not path.startswith(SHARED):
+            reads = f"flashsac and {', '.join(SHARED)}" if learner == FLASHSAC else "algorithm, actor and critic"
+            raise UserError(f"{path} is not read by {learner}, which reads {reads}")

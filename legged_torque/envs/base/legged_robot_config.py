@@ -3,11 +3,12 @@
 Values that belong to a robot are placeholders here, see :mod:`legged_torque.envs.robots`.
 """
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
-from legged_torque.envs.base.flashsac_config import FlashSACCfg
+from legged_torque.envs.base.flashsac_config import PPO, FlashSACCfg, preset, refuse_unread
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
@@ -31,7 +32,6 @@ from legged_torque.utils.limits import (
 Place = Annotated[list[float], Limits(-1e3, 1e3, length=3)]
 Scan = Annotated[list[float], Limits(-10, 10, nonempty=True)]
 Gains = Annotated[float | dict[str, float], Limits(lowest=0)]
-FLASHSAC = "legged_torque.learning.flashsac:FlashSAC"
 
 
 class LeggedRobotCfg(BaseConfig):
@@ -359,7 +359,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
         activation: Activation = "elu"  # after every hidden layer
 
     class algorithm:  # PPO, with rsl_rl's names
-        class_name: str = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
+        class_name: str = PPO  # rsl_rl's PPO without waiting for the host
         num_learning_epochs: Annotated[int, Limits(1, 1e4)] = 5  # times that each rollout is learned from
         num_mini_batches: Count = 4  # gradient steps per epoch
         clip_param: Positive = 0.2  # range of the probability ratio around 1, and of value changes
@@ -385,6 +385,10 @@ class LeggedRobotCfgPPO(TrainingCfg):
     class flashsac(FlashSACCfg):  # FlashSAC, the learner of the preset of that name
         pass
 
+    def refuse_unread(self, paths: Iterable[str]) -> None:
+        """Refuse settings of PPO if FlashSAC is chosen, and the other way round."""
+        refuse_unread(self.algorithm.class_name, paths)
+
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
         rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
@@ -393,10 +397,5 @@ class LeggedRobotCfgPPO(TrainingCfg):
         fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
         fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
-        flashsac = {
-            "env": {"num_envs": 1024, "num_envs_cpu": 1024},
-            "algorithm": {"class_name": FLASHSAC, "gamma": 0.99},
-        }
-        flashsac["runner"] = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
         thorough = {"runner": {"total_steps": 330_000_000}}
-        return {"parallel": {}, "thorough": thorough, "paper": table_ii, "flashsac": flashsac}
+        return {"parallel": {}, "thorough": thorough, "paper": table_ii, "flashsac": preset()}

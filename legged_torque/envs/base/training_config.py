@@ -56,6 +56,9 @@ class TrainingCfg(BaseConfig):
             setattr(cfg.algorithm, name, getattr(cfg.algorithm, name) ** (1.0 / ratio))
         cfg.evaluation.num_samples = max(round(cfg.evaluation.num_samples * ratio), 1)
 
+    def refuse_unread(self, paths: Iterable[str]) -> None:
+        """Raise a UserError if changed settings, by their dotted ``paths``, are not read by the chosen learner."""
+
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.
 

@@ -170,13 +170,11 @@ class FlashSAC:
             self.graphs[actor_learns]()
             self.num_updates += 1
             made["actor"] += actor_learns
-        further = torch.stack([self.log_temperature.detach().exp(), self.reward_scale.scale(), self.learning_rate])
-        values = torch.cat([*self._sums.values(), further]).tolist()  # the only time that the host waits
-        numbers = dict(zip(("temperature", "reward_scale", "learning_rate"), values[-3:], strict=True))
+        numbers = {"temperature": float(self.log_temperature.detach().exp())}  # here the host waits for the first time
+        numbers |= {"reward_scale": float(self.reward_scale.scale()), "learning_rate": float(self.learning_rate)}
         skipped = 0.0
         for name, names in (("actor", ACTOR_NUMBERS), ("critic", CRITIC_NUMBERS)):
-            *sums, kept = values[: len(names) + 1]
-            values = values[len(names) + 1 :]
+            *sums, kept = self._sums[name].tolist()
             skipped += made[name] - kept
             if kept:
                 numbers |= {key: total / kept for key, total in zip(names, sums, strict=True)}
@@ -202,8 +200,8 @@ class FlashSAC:
         loss, numbers = self.critic_loss(batch)
         self._descend("critic", loss, numbers, self.critic)
         with torch.no_grad():
-            slow, fast = [*self.target.parameters()], [*self.critic.parameters()]
-            torch._foreach_lerp_(slow, fast, self.settings["critic_target_update_tau"])
+            for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
+                slow.lerp_(fast, self.settings["critic_target_update_tau"])
 
     def _sample(self) -> Batch:
         """Return ``mini_batch_size`` samples, and their mirror images if symmetry is used."""
@@ -225,7 +223,8 @@ class FlashSAC:
         observations, too, as those of the critic do (CrossQ, arXiv 1902.05605).
         """
         size = len(batch.obs)
-        actions, log_density, std = self.actor.sample(torch.cat([batch.obs, batch.next_obs]), learning=True)
+        both: Any = torch.cat([batch.obs, batch.next_obs])
+        actions, log_density, std = self.actor.sample(both, learning=True)
         actions, log_density = actions[:size], log_density[:size]
         _, earned = self.critic(batch.obs, actions, learning=False)
         temperature, entropy = self.log_temperature.exp(), -log_density.mean()
@@ -239,7 +238,8 @@ class FlashSAC:
         size = len(batch.obs)
         with torch.no_grad():
             next_actions, log_density, _ = self.actor.sample(batch.next_obs, learning=False)
-            obs, actions = torch.cat([batch.obs, batch.next_obs]), torch.cat([batch.actions, next_actions])
+            obs: Any = torch.cat([batch.obs, batch.next_obs])
+            actions = torch.cat([batch.actions, next_actions])
             log_probs, means = self.target(obs, actions, learning=True)
             following = lower_of(log_probs[:, size:], means[:, size:]).exp()
             soft_values = self.critic.values - (self.log_temperature.exp() * log_density).unsqueeze(1)
@@ -273,7 +273,8 @@ class FlashSAC:
 
     def state_dict(self) -> dict[str, Any]:
         """Return all but the replay and what belongs to worlds, each tensor in memory of its own."""
-        parts = {**self._networks(), **{f"{name}_optimizer": part for name, part in self.optimizers.items()}}
+        parts: dict[str, Any] = {f"{name}_optimizer": part for name, part in self.optimizers.items()}
+        parts |= self._networks()
         state: dict[str, Any] = {f"{name}_state_dict": part.state_dict() for name, part in parts.items()}
         state |= {"log_temperature": self.log_temperature.detach(), "num_updates": self.num_updates}
         return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, state)
