@@ -3,12 +3,11 @@
 Values that belong to a robot are placeholders here, see :mod:`legged_torque.envs.robots`.
 """
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
-from legged_torque.envs.base.flashsac_config import PPO, FlashSACCfg, preset, refuse_unread
+from legged_torque.envs.base.flashsac_config import PPO, FlashSACCfg, preset
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
@@ -385,10 +384,6 @@ class LeggedRobotCfgPPO(TrainingCfg):
     class flashsac(FlashSACCfg):  # FlashSAC, the learner of the preset of that name
         pass
 
-    def refuse_unread(self, paths: Iterable[str]) -> None:
-        """Refuse settings of PPO if FlashSAC is chosen, and the other way round."""
-        refuse_unread(self.algorithm.class_name, paths)
-
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""
         rollouts = {"env": {"num_envs": 16, "num_envs_cpu": 16}, "runner": {"num_steps_per_env": 2000}}
@@ -397,5 +392,5 @@ class LeggedRobotCfgPPO(TrainingCfg):
         fixed = {"schedule": "fixed", "annealing_start": 1.0, "use_mixed_precision": False}
         fixed |= {"symmetry_cfg": {"use_data_augmentation": False}}
         table_ii = {**rollouts, "algorithm": {**ppo, **fixed}}  # to the letter
-        thorough = {"runner": {"total_steps": 330_000_000}}
+        thorough: dict[str, dict] = {"runner": {"total_steps": 330_000_000}}
         return {"parallel": {}, "thorough": thorough, "paper": table_ii, "flashsac": preset()}

@@ -174,10 +174,10 @@ class FlashSAC:
         numbers |= {"reward_scale": float(self.reward_scale.scale()), "learning_rate": float(self.learning_rate)}
         skipped = 0.0
         for name, names in (("actor", ACTOR_NUMBERS), ("critic", CRITIC_NUMBERS)):
-            *sums, kept = self._sums[name].tolist()
+            *totals, kept = self._sums[name].tolist()
             skipped += made[name] - kept
             if kept:
-                numbers |= {key: total / kept for key, total in zip(names, sums, strict=True)}
+                numbers |= {key: total / kept for key, total in zip(names, totals, strict=True)}
         return {**numbers, "skipped_updates": skipped, "all_skipped": skipped == sum(made.values())}
 
     def policy(self) -> FlashSACActor:
