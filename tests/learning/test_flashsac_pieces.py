@@ -112,6 +112,7 @@ def test_replay(steps, num_steps):
     task, happened, left_out = PointMasses(num_envs=4), {}, set()
     task.keep_final_observations, task.max_episode_length, obs = True, 7, task.get_observations()
     replay = Replay(obs, ["policy"], 1, 4 * 40, torch.float32, "cpu")
+    replay.allocate()
     for number in range(steps):  # kept by the observation before a step, which no other step has
         actions = 2.0 * torch.rand(4, 1)
         after, rewards, dones, extras = task.step(actions)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
-from legged_torque.envs.base.flashsac_config import PPO, FlashSACCfg, preset
+from legged_torque.envs.base.flashsac_config import FlashSACCfg, preset
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.training_config import Activation, TrainingCfg
@@ -358,7 +358,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
         activation: Activation = "elu"  # after every hidden layer
 
     class algorithm:  # PPO, with rsl_rl's names
-        class_name: str = PPO  # rsl_rl's PPO without waiting for the host
+        class_name: str = "legged_torque.learning.ppo:OnDevicePPO"  # rsl_rl's PPO without waiting for the host
         num_learning_epochs: Annotated[int, Limits(1, 1e4)] = 5  # times that each rollout is learned from
         num_mini_batches: Count = 4  # gradient steps per epoch
         clip_param: Positive = 0.2  # range of the probability ratio around 1, and of value changes

@@ -38,7 +38,7 @@ class FlashSAC:
     Attributes:
         actor: The policy.
         critic: Both critics.
-        target: Their copies, from which returns go on. Weights follow slowly; normalizations see every batch.
+        target: Their copies, with which returns go on. Weights follow slowly; normalizations see every batch.
         log_temperature: Logarithm of the weight of the entropy.
         replay: Past steps.
         reward_scale: What rewards are divided by.
@@ -99,28 +99,18 @@ class FlashSAC:
 
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> "FlashSAC":
-        """Build the learner with its networks and replay, from settings in rsl_rl's layout.
-
-        A UserError names a setting that is not supported, or sizes that do not fit each other.
-        """
+        """Build the learner from settings in rsl_rl's layout; a UserError names one that is not supported."""
         settings, groups, algorithm = cfg["flashsac"], cfg["obs_groups"], cfg["algorithm"]
         mirroring = dict(algorithm["symmetry_cfg"])
         if cfg["pretraining"]["function"]:
             raise UserError("FlashSAC does not support pretraining.function: it starts from random networks")
         if mirroring["use_mirror_loss"]:
             raise UserError("FlashSAC does not support algorithm.symmetry_cfg.use_mirror_loss")
-        size, least = settings["replay_buffer_size"], settings["buffer_min_length"]
-        lowest = (settings["n_steps"] + 1) * env.num_envs
-        if not lowest <= least <= size:
-            raise UserError(
-                f"flashsac.buffer_min_length must be from {lowest} (n_steps + 1 in {env.num_envs} worlds) to "
-                f"flashsac.replay_buffer_size, {size}, not {least}"
-            )
         bound, largest = settings["action_bound"], settings["normalized_g_max"]
         actor = FlashSACActor(obs, groups, "actor", env.num_actions, bound, **settings["actor"]).to(device)
         critic = FlashSACCritic(obs, groups, "critic", env.num_actions, largest, **settings["critic"]).to(device)
         kept, dtype = {*actor.obs_groups, *critic.obs_groups}, getattr(torch, settings["buffer_obs_dtype"])
-        replay = Replay(obs, sorted(kept), env.num_actions, size, dtype, device)
+        replay = Replay(obs, sorted(kept), env.num_actions, settings["replay_buffer_size"], dtype, device)
         symmetry = Symmetry(env, **mirroring) if mirroring["use_data_augmentation"] else None
         alg = cls(actor, critic, replay, settings, algorithm["gamma"], cfg["num_steps_per_env"], symmetry)
         for graph in alg.graphs.values():
@@ -130,7 +120,14 @@ class FlashSAC:
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
     def allocate(self) -> None:
-        """Make room for the replay; a UserError if the device has too little."""
+        """Make room for the replay; a UserError if sizes do not fit each other, or the device has too little."""
+        least, most = self.settings["buffer_min_length"], self.settings["replay_buffer_size"]
+        lowest = (self.settings["n_steps"] + 1) * self.replay.num_envs
+        if not lowest <= least <= most:
+            raise UserError(
+                f"flashsac.buffer_min_length must be from {lowest} (n_steps + 1 in {self.replay.num_envs} worlds) to "
+                f"flashsac.replay_buffer_size, {most}, not {least}"
+            )
         self.replay.allocate()
 
     def act(self, obs: TensorDict) -> Tensor:
@@ -142,6 +139,7 @@ class FlashSAC:
 
     def observe(self, transition: Transition) -> None:
         """Keep a step, and let the scale of rewards follow it."""
+        self.allocate()  # of a training that keeps no run
         self.reward_scale.follow(self.returns, transition.rewards, transition.dones)
         self.replay.add(transition, transition.actions / self.actor.action_bound)
 

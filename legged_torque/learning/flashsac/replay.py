@@ -59,16 +59,12 @@ class Replay:
         self._final = zeros  # observations after the last step, before any reset
         self._timed_out = torch.zeros(len(obs), dtype=torch.bool, device=device)  # whether that was a time-out
 
-    def num_bytes(self) -> int:
-        """Return the memory that it needs on the device."""
-        per_step = self._dtype.itemsize * sum(self._sizes.values()) + 4 * (self.num_actions + 1) + 3
-        return self.rows * self.num_envs * per_step
-
     def allocate(self) -> None:
         """Make room, if that has not been done; a UserError if the device has too little."""
         if self._steps:
             return
-        needed, free = self.num_bytes(), free_memory(self.device)
+        per_step = self._dtype.itemsize * sum(self._sizes.values()) + 4 * (self.num_actions + 1) + 3
+        needed, free = per_step * self.rows * self.num_envs, free_memory(self.device)
         if needed > free:
             raise UserError(
                 f"the replay of flashsac.replay_buffer_size = {self.rows * self.num_envs} steps needs "
@@ -84,8 +80,7 @@ class Replay:
         }
 
     def add(self, transition: Transition, actions: Tensor) -> None:
-        """Keep a step, with ``actions`` in [-1, 1]; nothing waits for the host."""
-        self.allocate()
+        """Keep a step, with ``actions`` in [-1, 1], once there is room; nothing waits for the host."""
         assert transition.next_obs is not None
         dones, time_outs = transition.dones, transition.time_outs
         timed_out = torch.zeros_like(dones) if time_outs is None else dones & time_outs
