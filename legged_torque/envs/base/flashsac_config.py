@@ -32,14 +32,14 @@ class FlashSACCfg(Section):
     actor_noise_zeta_mu: Positive = 2.0  # noise is repeated for n steps with a probability in proportion to n^-mu
     actor_noise_zeta_max: Annotated[int, Limits(1, 1e6)] = 16  # the largest n
     normalized_g_max: Positive = 5.0  # largest return that the critic knows, in units of scaled rewards
-    action_bound: Positive = 2.0  # largest action, in the units of control.action_scale and control.torque_scale; ours
+    action_bound: Positive = 2.0  # largest action, in units of control.action_scale and torque_scale; ours, not tuned
 
     class actor:  # the policy's network
         hidden_dim: Annotated[int, Limits(1, 1e6)] = 128  # size of its features
         num_blocks: Annotated[int, Limits(1, 100)] = 2  # of two layers each
 
     class critic:  # both critics
-        hidden_dim: Annotated[int, Limits(1, 1e6)] = 256  # size of their features
+        hidden_dim: Annotated[int, Limits(1, 1e6)] = 256  # size of their features; below 64 they learn badly
         num_blocks: Annotated[int, Limits(1, 100)] = 2  # of two layers each
         num_bins: Annotated[int, Limits(2, 10_000)] = 101  # values of their distributions
 
