@@ -26,7 +26,7 @@ from legged_torque.envs.approaches import (
     torque_gravity,
     variable_stiffness_config,
 )
-from legged_torque.envs.base import commands_config, legged_robot_config, linear_change
+from legged_torque.envs.base import commands_config, flashsac_config, legged_robot_config, linear_change
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.state import RobotState
@@ -40,7 +40,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
-SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
+SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors.", "FlashSACCfg": "flashsac."}
 """Where the settings of some classes stand."""
 CONFIGS = (
     (linear_change, "LinearChange"),
@@ -48,6 +48,7 @@ CONFIGS = (
     (commands_config, "CommandsCfg"),
     *((model_config, f"{name}Cfg") for name in ("Motors", "Model", "Curve", *LINKS)),
     (legged_robot_config, "LeggedRobotCfgPPO"),
+    (flashsac_config, "FlashSACCfg"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
     (anymal_c, "AnymalCCfg"),

@@ -44,6 +44,8 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
         symmetry = getattr(self.alg, "symmetry", None)
         if log_dir and symmetry:  # refuse what has no mirror image before a folder is made
             symmetry.data_augmentation_func(env=env, obs=env.get_observations()[:1], actions=None)
+        if log_dir and hasattr(self.alg, "allocate"):  # so that too much memory is refused before that, too
+            self.alg.allocate()
 
     def get_inference_policy(self, device: str | None = None) -> nn.Module:
         """Return the policy for inference, on a device if one is given."""

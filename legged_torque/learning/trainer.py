@@ -75,7 +75,7 @@ class Trainer:
         self._saved_iteration = -1
         self._has_old_worlds = False  # whether the worlds are those of a checkpoint
         self._log = TrainingLog(env, logger, cfg)
-        self._worlds = Worlds(env, cfg["evaluation"], [*self._evaluators, self._log])
+        self._worlds = Worlds(env, alg, cfg["evaluation"], [*self._evaluators, self._log])
 
     @property
     def log_dir(self) -> str | None:
@@ -255,7 +255,8 @@ class Trainer:
             for evaluator in self._evaluators:
                 evaluator.reset()
             if distributed.rank() == 0:
-                print(f"The worlds start anew: {error}.")
+                kept = ", and what the learner keeps of them" if hasattr(self.alg, "world_state_dict") else ""
+                print(f"The worlds start anew{kept}: {error}.")
         self.continue_random_numbers(infos)
 
     def continue_random_numbers(self, infos: dict) -> None:

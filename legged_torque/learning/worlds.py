@@ -21,9 +21,10 @@ from legged_torque.utils.errors import UserError
 class Worlds:
     """Keeps the state of all processes of a training that is not in its checkpoints."""
 
-    def __init__(self, task: Any, evaluation: dict[str, Any], others: list[Stateful]) -> None:
-        """Take the task, the settings ``evaluation``, and other objects whose state belongs to the worlds."""
+    def __init__(self, task: Any, learner: Any, evaluation: dict[str, Any], others: list[Stateful]) -> None:
+        """Take task, learner, the settings ``evaluation``, and other objects whose state belongs to the worlds."""
         self._task, self._others = task, others
+        self._owners = {"worlds": task} | ({"learner": learner} if hasattr(learner, "world_state_dict") else {})
         self._evaluation = {key: evaluation[key] for key in ("num_envs", "perturbation")}
 
     def write(self, checkpoint_file: Path) -> str:
@@ -33,7 +34,7 @@ class Worlds:
         """
         if not hasattr(self._task, "identity"):
             return ""
-        state = {"worlds": self._task.world_state_dict()}
+        state = {name: owner.world_state_dict() for name, owner in self._owners.items()}
         for other in self._others:
             state |= other.state_dict()
         copies = tree_map(lambda value: value.detach().cpu().clone() if isinstance(value, Tensor) else value, state)
@@ -67,7 +68,8 @@ class Worlds:
         try:
             for other in self._others:
                 other.load_state_dict(state)
-            self._task.load_world_state_dict(state["worlds"])
+            for name, owner in self._owners.items():
+                owner.load_world_state_dict(state[name])
         except (RuntimeError, KeyError, TypeError, ValueError) as error:
             raise UserError(f"'{file}' does not fit: {checkpoint.last_line(error)}") from None
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes.util
+import math
 import os
 import re
 import time
@@ -11,6 +12,7 @@ from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
 
 COUNTS = Path("/proc/stat")  # Linux's times of the cores
+MEMORY = Path("/proc/meminfo")  # and its memory
 MANY = 0.3  # busy cores from which on others are in the way
 SECONDS = 0.3  # of observing them
 INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
@@ -50,6 +52,18 @@ def device_name(device: str) -> str:
         return torch.cuda.get_device_name(device)
     threads = torch.get_num_threads()
     return f"CPU, {threads} thread{'s' if threads > 1 else ''}"
+
+
+def free_memory(device: str) -> float:
+    """Return how many bytes there are left for new tensors; of a CPU, inf elsewhere than on Linux."""
+    import torch
+
+    if torch.device(device).type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    with contextlib.suppress(OSError, ValueError):
+        lines = MEMORY.read_text().splitlines()
+        return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+    return math.inf
 
 
 def busy_cores() -> float:

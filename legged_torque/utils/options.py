@@ -37,8 +37,8 @@ class Options:
     )
     seed: Number | None = _option("random seed; default: that of the training settings")
     preset: str | None = _option(
-        "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long) or "
-        "paper (Table II)"
+        "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long), "
+        "paper (Table II) or flashsac (another learner)"
     )
     perturbation: str | None = _option(
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
@@ -117,6 +117,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
                 raise UserError(replaced)
             raise unknown_name("config section", section, sections)
         set_by_path(sections[section], path, value)
+    train_cfg.refuse_unread(path for path, _ in changes)
 
 
 def apply_perturbation(env_cfg: Any, name: str) -> None:

@@ -4,11 +4,8 @@ import copy
 
 import torch
 from rsl_rl.modules import MLP
-from rsl_rl.utils.logger import Logger
+from support.point_masses import PointMasses, make_trainer
 from support.settings import error_of
-from tensordict import TensorDict
-
-from legged_torque.learning.trainer import Trainer
 
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
 
@@ -97,79 +94,10 @@ class TDLearner:
         self.count = state["count"]
 
 
-class PointMasses:
-    """Points on a line that are to be at 0; just what the trainer needs of a task."""
-
-    num_actions, device, dt, max_episode_length, num_processes = 1, "cpu", 0.1, 20, 1
-    keep_final_observations = False
-
-    def __init__(self, num_envs=8):
-        self.num_envs, self.log, self.health = num_envs, self, self
-        self.x, self.length = 2.0 * torch.rand(num_envs) - 1.0, torch.zeros(num_envs, dtype=torch.long)
-        self.total_steps, self.distance = torch.zeros((), dtype=torch.long), 0.0
-        self.episode_length_buf = self.length
-
-    def get_observations(self):
-        return TensorDict({"policy": self.x[:, None].clone()}, [self.num_envs])
-
-    def step(self, actions):
-        self.x += 0.2 * actions[:, 0]
-        self.length += 1
-        self.total_steps += self.num_envs * self.num_processes
-        rewards = -self.x.square()
-        self.distance = float(self.x.abs().mean())
-        far, time_outs = self.x.abs() > 1.5, self.length >= self.max_episode_length
-        extras = {"time_outs": time_outs & ~far}
-        if self.keep_final_observations:
-            extras["final_observations"] = self.get_observations()
-        dones = far | time_outs
-        self.x = torch.where(dones, 2.0 * torch.rand(self.num_envs) - 1.0, self.x)
-        self.length.masked_fill_(dones, 0)
-        return self.get_observations(), rewards, dones, extras
-
-    def read(self, max_episode_length_s=None):
-        """Both the log and the health."""
-        return (0.0, {}) if max_episode_length_s is None else {"Task/distance": self.distance}
-
-    def curriculum_values(self):
-        return {}
-
-    def check_buffers(self):
-        return None
-
-    compile = update_curriculum = check_buffers
-
-    def state_dict(self):
-        return {"total_steps": self.total_steps.clone()}
-
-    def load_state_dict(self, state):
-        self.total_steps.copy_(state["total_steps"])
-
-    def identity(self):
-        return {"settings": {"num_envs": self.num_envs}}
-
-    def world_state_dict(self):
-        return {"x": self.x, "length": self.length}
-
-    def load_world_state_dict(self, state):
-        self.x.copy_(state["x"])
-        self.length.copy_(state["length"])
-
-
-def make_trainer(folder=None, learner=TDLearner, task=None, **settings):
-    """A trainer of a learner in point masses, with nothing but what it needs."""
-    task = task or PointMasses()
-    evaluation = {"interval": 0, "also": [], "perturbation": "", "num_envs": 1, "num_samples": 1}
-    cfg = {"num_steps_per_env": 8, "save_interval": 100, "capture": True, "seed": 0, "evaluation": evaluation}
-    cfg |= {"algorithm": {}, "logger": {"class_name": "legged_torque.learning.training_log:NoLogWriter"}, **settings}
-    logger = Logger(str(folder) if folder else None, cfg, {}, task.num_envs, False, 1, 0, "cpu")
-    return Trainer(task, learner.construct_algorithm(task.get_observations(), task, cfg, "cpu"), cfg, logger)
-
-
 def test_it_learns_to_hold_point_masses():
     """Its policy drives every point to 0, from which it was anywhere before."""
     torch.manual_seed(0)
-    trainer = make_trainer()
+    trainer = make_trainer(TDLearner)
     trainer.learn(60, init_at_random_ep_len=True)
     x = torch.linspace(-1.0, 1.0, 9)[:, None]
     with torch.no_grad():
@@ -182,7 +110,7 @@ def test_it_learns_to_hold_point_masses():
 def test_next_observations_are_those_before_resets():
     """Every kept transition is that of the points' motion, also where an episode has ended."""
     torch.manual_seed(1)
-    trainer = make_trainer()
+    trainer = make_trainer(TDLearner)
     trainer.learn(6)
     kept = {name: rows[: trainer.alg.count] for name, rows in trainer.alg.buffer.items()}
     torch.testing.assert_close(kept["next_obs"], kept["obs"] + 0.2 * kept["actions"])
@@ -192,7 +120,7 @@ def test_next_observations_are_those_before_resets():
 
 def test_no_update_before_it_is_due(tmp_path):
     """Two rollouts of 8 steps come before the first update; all of them count as iterations."""
-    trainer = make_trainer(tmp_path)
+    trainer = make_trainer(TDLearner, tmp_path)
     before = copy.deepcopy(trainer.alg.policy().state_dict())
     trainer.learn(1)
     assert all(torch.equal(value, before[name]) for name, value in trainer.alg.policy().state_dict().items())
@@ -205,7 +133,7 @@ def test_two_and_two_are_four(tmp_path):
     """A training that was resumed has the same bits as one that never stopped, the replay buffer included."""
     for folder, iterations in (("whole", 4), ("half", 2), ("resumed", 2)):
         torch.manual_seed(3)
-        trainer = make_trainer(tmp_path / folder)
+        trainer = make_trainer(TDLearner, tmp_path / folder)
         if folder == "resumed":
             trainer.resume(str(tmp_path / "half" / "model_2.pt"))
         trainer.learn(iterations)
@@ -218,8 +146,8 @@ def test_two_and_two_are_four(tmp_path):
 def test_what_does_not_fit_is_refused():
     """The lines name the learner, the task and what is missing."""
     deaf = type("Deaf", (TDLearner,), {"observe": property()})
-    message = error_of(make_trainer, learner=deaf)
+    message = error_of(make_trainer, deaf)
     assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
     forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
-    message = error_of(make_trainer, task=forgetful())
+    message = error_of(make_trainer, TDLearner, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
+from legged_torque.envs.base.flashsac_config import FlashSACCfg
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.presets import standard_presets
@@ -378,6 +379,9 @@ class LeggedRobotCfgPPO(TrainingCfg):
             use_mirror_loss: bool = False  # whether actions that are not mirror images cost
             mirror_loss_coeff: NotNegative = 0.1  # weight of that loss
             data_augmentation_func: str = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them
+
+    class flashsac(FlashSACCfg):  # FlashSAC, the learner of the preset of that name
+        pass
 
     def presets(self) -> dict[str, dict]:
         """Return the named changes to the settings of task and training that ``--preset`` chooses from."""

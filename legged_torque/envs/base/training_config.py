@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from legged_torque.envs.base.flashsac_config import refuse_unread
 from legged_torque.envs.base.linear_change import scale_changes
 from legged_torque.utils.config import BaseConfig, flat, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -68,6 +69,11 @@ class TrainingCfg(BaseConfig):
         for name in ("gamma", "lam"):
             setattr(cfg.algorithm, name, getattr(cfg.algorithm, name) ** (1.0 / ratio))
         cfg.evaluation.num_samples = max(round(cfg.evaluation.num_samples * ratio), 1)
+
+    def refuse_unread(self, paths: Iterable[str]) -> None:
+        """Raise a UserError if changed settings, by their dotted ``paths``, are not read by the chosen learner."""
+        cfg: Any = self
+        refuse_unread(cfg.algorithm.class_name, paths)
 
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.

@@ -1,0 +1,202 @@
+"""FlashSAC as a learner: what it learns, what it keeps, how it exports, and what is refused."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from support.point_masses import make_trainer
+from support.scripts import SMALL, assert_told_in_one_line, run_here
+from support.settings import error_of, get_cfgs
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from legged_torque.envs import task_registry
+from legged_torque.learning.flashsac import FlashSAC
+from legged_torque.learning.flashsac.returns import projected
+from legged_torque.learning.protocols import Transition
+from legged_torque.utils.config import to_dict
+
+SIZES = [f"flashsac.{network}.{size}" for network in ("actor", "critic") for size in ("hidden_dim=64", "num_blocks=1")]
+SIZES += ["flashsac.mini_batch_size=64", "flashsac.buffer_min_length=128", "flashsac.replay_buffer_size=4000"]
+SIZES += ["flashsac.critic.num_bins=21", "flashsac.updates_per_step=1", "evaluation.interval=0", "runner.logger=none"]
+
+
+def make(*changes, folder=None):
+    """A trainer of FlashSAC in point masses, with settings changed like those of a command line."""
+    words = [f"--set={change}" for change in (*SIZES, "flashsac.action_bound=1", "algorithm.gamma=0.9", *changes)]
+    cfg = to_dict(get_cfgs("--preset=flashsac", *words)[1])
+    cfg["algorithm"]["symmetry_cfg"]["use_data_augmentation"] = False
+    used = {name: cfg[name] for name in ("flashsac", "algorithm", "pretraining")}
+    return make_trainer(FlashSAC, folder, **used, obs_groups={"actor": ["policy"], "critic": ["policy"]})
+
+
+def test_it_learns_to_hold_point_masses():
+    """Its policy drives every point to 0, from which it was anywhere before."""
+    torch.manual_seed(0)
+    faster = ("flashsac.learning_rate_peak=1e-3", "flashsac.critic_target_update_tau=0.05")
+    trainer = make("flashsac.critic.num_bins=51", *faster)
+    trainer.learn(60, init_at_random_ep_len=True)
+    x = torch.linspace(-1.0, 1.0, 9)[:, None]
+    with torch.no_grad():
+        for _ in range(15):
+            x = x + 0.2 * trainer.alg.policy()({"policy": x})
+    assert float(x.abs().max()) < 0.15
+
+
+def test_losses():
+    """They are those of the paper in loops, and the temperature follows the entropy."""
+    torch.manual_seed(0)
+    trainer = make()
+    trainer.learn(3)
+    alg, batch = trainer.alg, trainer.alg.replay.sample(8, 3, 0.9)
+    values, temperature = alg.critic.values, alg.log_temperature.detach().exp()
+    torch.manual_seed(5)
+    loss, (actor_loss, entropy, _) = alg.actor_loss(batch)
+    torch.manual_seed(5)
+    actions, log_density, _ = alg.actor.sample(torch.cat([batch.obs, batch.next_obs]), learning=True)
+    earned = (alg.critic(batch.obs, actions[:8], learning=False)[0].exp() * values).sum(dim=-1)
+    rows = [temperature * log_density[i] - min(earned[0, i], earned[1, i]) for i in range(8)]
+    torch.testing.assert_close(actor_loss, torch.stack(rows).mean().detach())
+    torch.testing.assert_close(entropy, -log_density[:8].mean().detach())
+    target = 0.5 * math.log(2.0 * math.pi * math.e * 0.15**2)  # of one action
+    (grad,) = torch.autograd.grad(loss, alg.log_temperature, retain_graph=True)
+    torch.testing.assert_close(grad, temperature * (entropy - target))
+
+    batch = dataclasses.replace(batch, weights=torch.tensor([0.0] + [1.0] * 7))
+    torch.manual_seed(6)
+    loss, _ = alg.critic_loss(batch)
+    torch.manual_seed(6)
+    actions, log_density, _ = alg.actor.sample(batch.next_obs, learning=False)
+    both = torch.cat([batch.obs, batch.next_obs]), torch.cat([batch.actions, actions])
+    targets, predicted = alg.target(*both, learning=True)[0][:, 8:], alg.critic(*both, learning=True)[0]
+    losses = []
+    for i in range(1, 8):
+        probs = min((targets[k, i].exp() for k in (0, 1)), key=lambda probs: float((probs * values).sum()))
+        places = batch.rewards[i] / alg.reward_scale.scale()
+        places = places + batch.discounts[i] * (values - temperature * log_density[i])
+        wanted = projected(probs[None], places[None], values)[0]
+        losses += [-(wanted * predicted[k, i]).sum() for k in (0, 1)]
+    torch.testing.assert_close(loss, torch.stack(losses).mean())
+
+
+@pytest.mark.parametrize("save", [True, False])
+def test_resume(tmp_path, capsys, save):
+    """With its replay, a resumed training has the bits of one that never stopped; without, it says so and goes on."""
+    for folder, iterations in (("whole", 4), ("half", 2), ("resumed", 2)):
+        torch.manual_seed(3)
+        trainer = make(f"flashsac.save_replay={save}", "flashsac.learning_rate_end=3e-4", folder=tmp_path / folder)
+        if folder == "resumed":
+            trainer.resume(str(tmp_path / "half" / "model_2.pt"))
+        trainer.learn(iterations)
+    whole, resumed = (torch.load(tmp_path / name / "model_4.pt", weights_only=True) for name in ("whole", "resumed"))
+    parts = [part for part in whole if part.startswith(("actor_state", "critic_state", "critic_target", "reward"))]
+    same = [torch.equal(value, resumed[part][name]) for part in parts for name, value in whole[part].items()]
+    assert len(parts) == 4 and all(same) == save
+    assert (whole["num_updates"], resumed["num_updates"]) == (24, 24 if save else 16)
+    assert ("The replay starts empty" in capsys.readouterr().out) != save
+
+
+class NoWaiting(TorchDispatchMode):
+    """Refuses operations whose results the host needs."""
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        assert not any(part in str(function) for part in ("_local_scalar", "nonzero", "masked_select")), function
+        return function(*args, **(kwargs or {}))
+
+
+def test_nothing_waits_for_the_host_and_tensors_stay():
+    """Acting, observing and a gradient step read no number from the device, and move no tensor that they keep."""
+    trainer = make("flashsac.save_replay=true")
+    trainer.learn(2)
+    alg, task = trainer.alg, trainer.env
+
+    def addresses():
+        state = alg.world_state_dict()
+        tensors = [*state["replay"].values(), *state["noise"].values(), *alg.reward_scale.buffers(), alg.learning_rate]
+        return [t.data_ptr() for t in (*tensors, *alg.actor.state_dict().values(), *alg.target.state_dict().values())]
+
+    before, obs = addresses(), task.get_observations()
+    with NoWaiting(), torch.no_grad():
+        actions = alg.act(obs)
+    after, rewards, dones, extras = task.step(actions)
+    parts = (obs, actions, rewards, dones, extras["time_outs"], after, extras["final_observations"], extras)
+    with NoWaiting(), torch.no_grad():
+        alg.observe(Transition(*parts))
+    with NoWaiting():
+        for actor_learns in (True, False):
+            alg.take_gradient_step(actor_learns)
+    assert addresses() == before
+
+
+def test_numbers_that_are_not_finite():
+    """Gradient steps of the critic with them change no weight and are counted."""
+    trainer = make()
+    trainer.learn(3)
+    trainer.env.step = lambda actions, step=trainer.env.step: [
+        math.nan * x if i == 1 else x for i, x in enumerate(step(actions))
+    ]
+    for _ in range(60):
+        trainer.collect_rollout()
+    before = [value.clone() for value in trainer.alg.critic.parameters()]
+    assert trainer.alg.update()["skipped_updates"] >= 8
+    torch.testing.assert_close([*trainer.alg.critic.parameters()], before)
+
+
+@pytest.mark.parametrize("task", ["a1_torque_multihead", "a1_rough_position_scan"])
+def test_robots_learn_and_export(task, tmp_path):
+    """Every parameter moves, half of each batch is mirror images, and an export gives the policy's actions."""
+    pytest.importorskip("onnxruntime")
+    from legged_torque.deploy.export import export_policy
+    from legged_torque.deploy.policy import Policy
+
+    env_cfg, cfg = get_cfgs("--preset=flashsac", "--num_envs=4", *(f"--set={change}" for change in SIZES), task=task)
+    env, _ = task_registry.make_env(task, None, env_cfg)
+    runner, _ = task_registry.make_alg_runner(env, task, train_cfg=cfg, log_root=None)
+    alg = runner.alg
+    named = [*alg.actor.named_parameters(), *alg.critic.named_parameters()]
+    before = [value.clone() for _, value in named]
+    runner.learn(6, init_at_random_ep_len=True)
+    assert not [name for (name, value), old in zip(named, before, strict=True) if torch.equal(value, old)]
+    batch = alg._sample()
+    for name, values in {**batch.obs, **batch.next_obs, "actions": batch.actions}.items():
+        assert len(values) == len(batch.rewards) == 2 * 64
+        torch.testing.assert_close(env.mirror(name, values[64:]), values[:64])
+    if "scan" not in task:
+        export_policy(
+            env,
+            alg.policy(),
+            tmp_path / "out",
+            task,
+            dict.fromkeys(("run", "checkpoint"), "") | dict.fromkeys(("iterations", "total_steps"), 6),
+        )
+        obs, policy = env.get_observations(), Policy(tmp_path / "out")
+        expected = alg.policy()(obs).detach().numpy()
+        np.testing.assert_allclose([policy.act(row) for row in obs["policy"].numpy()], expected, atol=1e-5)
+        assert 0.0 < np.abs(expected).max() <= 2.0
+
+
+REFUSED = {
+    "flashsac.mini_batch_size=0": "flashsac.mini_batch_size must be at least 1",
+    "flashsac.buffer_min_length=4001": "flashsac.replay_buffer_size, 4000",
+    "flashsac.buffer_min_length=7": "flashsac.buffer_min_length must be from 8",
+    "flashsac.replay_buffer_size=900000000000": "GiB",
+    "algorithm.symmetry_cfg.use_mirror_loss=true": "use_mirror_loss",
+    "algorithm.clip_param=0.1": "algorithm.clip_param is not read",
+    "actor.hidden_dims=[8]": "actor.hidden_dims is not read",
+    "algorithm.class_name=mine:Learner": "mine:Learner",
+}
+
+
+@pytest.mark.parametrize("change", REFUSED)
+def test_mistakes(tmp_path, change):
+    """One line, exit status 2, and no run."""
+    words = [f"--set={item}" for item in (*SIZES, change)]
+    result = run_here("train.py", *SMALL, "--preset=flashsac", *words, root=tmp_path)
+    assert_told_in_one_line(result, REFUSED[change])
+    assert not [*tmp_path.rglob("config.yaml")]
+
+
+def test_settings_of_flashsac_are_refused_with_ppo():
+    """PPO would not read them."""
+    assert "flashsac.n_steps is not read" in error_of(get_cfgs, "--set=flashsac.n_steps=1")
