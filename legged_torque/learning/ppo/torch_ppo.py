@@ -274,7 +274,7 @@ class TorchPPO(PPO):
         storage, indices = self.storage, self.indices
 
         def pick(tensor: Tensor) -> Tensor:
-            return tensor.flatten(0, 1)[indices]
+            return tensor.flatten(0, 1).index_select(0, indices)
 
         advantages = pick(storage.advantages)
         if self.normalize_advantage_per_mini_batch:
