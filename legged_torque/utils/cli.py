@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_torque import SCRIPTS_DIR
-from legged_torque.utils import distributed
 from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.devices import disable_renderer
 from legged_torque.utils.errors import TrainingError, UserError, has_lost_process, is_out_of_memory, unknown_name
@@ -272,7 +271,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
     finally:
         if "triton" in sys.modules:
             gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
-    if distributed.rank() > 0:
+    if os.environ.get("RANK", "0") != "0":
         time.sleep(LAST_WORDS)  # in which the first process, which has started this one, may end it
     print(line, file=sys.stderr)
     sys.exit(status)

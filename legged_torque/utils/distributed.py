@@ -62,8 +62,10 @@ def use_cores(num_processes: int) -> None:
     """
     import torch
 
+    if num_processes == world_size() == 1:
+        return
     torch.set_flush_denormal(True)
-    if num_processes == 1 or world_size() > 1:
+    if world_size() > 1:
         return
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -1,5 +1,7 @@
 """Gravity pre-training: the torque policy starts from one that has learned to stand by supervision (paper, III-A)."""
 
+from typing import Any
+
 from legged_torque.envs.approaches.torque_config import TorqueCfgPPO
 from legged_torque.utils.config import Section
 from legged_torque.utils.limits import Count, Fraction, NotNegative, Number, Positive, Share
@@ -31,3 +33,9 @@ class TorqueGravityCfgPPO(TorqueCfgPPO):
             attitude_damping: NotNegative = 15.0  # [1/s] of its angular velocity
             position_stiffness: NotNegative = 20.0  # [1/s^2] of the trunk towards its height
             position_damping: NotNegative = 6.0  # [1/s] of its linear velocity
+
+    def presets(self) -> dict[str, dict[str, Any]]:
+        """Return all but the laptop's: its small networks would need a pre-trained policy of their own."""
+        named = super().presets()
+        del named["laptop"]
+        return named
