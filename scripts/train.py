@@ -70,7 +70,8 @@ def main() -> None:
         env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or run.config.get("max_iterations")
-        processes = run.config.get("processes", 1)
+        kept = run.config.get("processes")  # from a file
+        processes = min(max(kept, 1), distributed.MAX_PROCESSES) if isinstance(kept, int) else 1
         if is_first:
             print(f"Resuming from {run.checkpoint}, after {counted(run.iterations, 'iteration')}.")
     elif options.load_run or options.checkpoint is not None:
@@ -80,8 +81,11 @@ def main() -> None:
         with cli.slow_imports():
             env_cfg, train_cfg = new_settings(options)
         processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
-    if options.preset == CPU_PRESET and resolve_device(options.device) == "cpu":
-        distributed.use_cores(processes)
+    on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu"
+    if on_cores and distributed.use_cores(processes) and options.resume:
+        from legged_torque.learning.first_run import use_first_run
+
+        use_first_run(options)  # as the others do
     folder = experiment_dir(train_cfg, options.log_root)
     if is_first:  # the others write nothing
         cli.check_output(new_run_dir(folder, train_cfg.runner.run_name) / CONFIG_FILE)

@@ -54,19 +54,19 @@ def usable_cores() -> int:
     return min(cores, int(limit)) if limit.isdecimal() and int(limit) > 0 else cores
 
 
-def use_cores(num_processes: int) -> None:
-    """Let so many processes in all train together on the cores of this machine; this one becomes the first of them.
+def use_cores(num_processes: int) -> bool:
+    """Let so many processes in all train together on the cores of this machine; return whether others were started.
 
-    The others run this process's command line, each with one thread, and end with this process; they call this function
-    as well, and start none. Numbers below 1e-38 count as 0, which saves a tenth of the time.
+    This process is the first one. The others run its command line, each with one thread, and end with it; they call
+    this function as well, and start none. Numbers below 1e-38 count as 0, which saves a tenth of the time.
     """
     import torch
 
     if num_processes == world_size() == 1:
-        return
+        return False
     torch.set_flush_denormal(True)
     if world_size() > 1:
-        return
+        return False
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -76,6 +76,7 @@ def use_cores(num_processes: int) -> None:
     command = ending_with_parent([sys.executable, *sys.orig_argv[1:]])
     for number in map(str, range(1, num_processes)):
         subprocess.Popen(command, env={**os.environ, "RANK": number, "LOCAL_RANK": number})
+    return True
 
 
 def _variable(name: str, lowest: int) -> int:

@@ -53,6 +53,12 @@ def test_all_cores(tmp_path, end):
         last = max(run.glob("model_*.pt"), key=lambda file: int(file.stem.split("_")[1]))
         state = torch.load(last, weights_only=True)
         assert state["infos"]["total_timesteps"] == state["iter"] * 2 * WORLDS * STEPS > 0
+        with train(tmp_path, "--resume", f"--max_iterations={state['iter'] + 2}") as process:
+            output = process.communicate()[0]
+        assert process.returncode == 0 and "start anew" not in output, output
+        (file,) = tmp_path.glob(f"a1_position/*/model_{state['iter'] + 2}.pt")
+        resumed = torch.load(file, weights_only=True)
+        assert resumed["infos"]["total_timesteps"] == (state["iter"] + 2) * 2 * WORLDS * STEPS
 
 
 @pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])
