@@ -24,11 +24,13 @@ def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables)
     environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
     environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
     streams = {"stdin": slave, "stdout": slave, "stderr": slave}
-    how = {
-        "env": environment,
-        "start_new_session": True,
-        "preexec_fn": lambda: fcntl.ioctl(slave, termios.TIOCSCTTY, 0),
-    }
+
+    def take_terminal():
+        """Make it the controlling one, and notice when it closes, also in tests that run under nohup."""
+        fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+    how = {"env": environment, "start_new_session": True, "preexec_fn": take_terminal}
     process = subprocess.Popen([sys.executable, "-c", code], **streams, **how)
     os.close(slave)
     output = b""
