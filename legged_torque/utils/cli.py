@@ -272,6 +272,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         if "triton" in sys.modules:
             gc.unfreeze()  # what Python does not collect when it ends, triton reports as leaks
     if os.environ.get("RANK", "0") != "0":
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # Linux may send it once for each thread of a parent that dies
         time.sleep(LAST_WORDS)  # in which the first process, which has started this one, may end it
     print(line, file=sys.stderr)
     sys.exit(status)

@@ -1,6 +1,7 @@
 """The preset laptop: a training on a CPU, in a process per core, with shorter curricula."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,43 +23,41 @@ SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--s
 SMALL += ["--device=cpu", "--logger=none", "--set=evaluation.interval=0", "--task=a1_position"]
 
 
-def train(folder, *words):
-    """Start train.py on two cores."""
+def train_and_end(folder, number, *words):
+    """Start train.py on two cores, send its process a signal after an iteration, and wait until all have ended.
+
+    Returns:
+        Exit status of the first process, what all have printed, and how many others there were.
+    """
     command = [sys.executable, ROOT / "scripts" / "train.py", *SMALL, f"--log_root={folder}", *words]
     environment = os.environ | {"OMP_NUM_THREADS": "2", "PYTHONUNBUFFERED": "1"}
-    return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-
-
-def children(process):
-    """Numbers of the processes that a process has started and that are not over."""
-    return Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    output, others = "", []
+    with subprocess.Popen(
+        command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as process:
+        for line in process.stdout:  # until all have closed it
+            output += line
+            if line.startswith("iteration ") and not others:
+                others = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+                process.send_signal(number)
+    assert "Traceback" not in output, output
+    return process.returncode, output, len(others)
 
 
 @pytest.mark.skipif(sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="two cores of Linux")
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
-def test_all_cores(tmp_path, end):
-    """Both processes train one policy, and both end when the first one is interrupted, which saves, or killed."""
-    with train(tmp_path, "--max_iterations=100000") as process:
-        output, started = "", []
-        for line in process.stdout:  # until both have closed it
-            output += line
-            if line.startswith("iteration ") and not started:
-                started = children(process)
-                process.send_signal(end)
-    assert len(started) == 1 and "Traceback" not in output, output
+def test_all_cores(tmp_path):
+    """Two processes train one policy: both end when the first one is interrupted, resume, and end when it is killed."""
+    status, output, others = train_and_end(tmp_path, signal.SIGINT, "--max_iterations=100000")
+    assert (status, others) == (130, 1) and output.count("Stopping after this iteration") == 1
     (run,) = (tmp_path / "a1_position").iterdir()
     assert yaml.safe_load((run / "config.yaml").read_text())["processes"] == 2
-    if end == signal.SIGINT:
-        assert process.returncode == 130 and output.count("Stopping after this iteration") == 1
-        last = max(run.glob("model_*.pt"), key=lambda file: int(file.stem.split("_")[1]))
-        state = torch.load(last, weights_only=True)
-        assert state["infos"]["total_timesteps"] == state["iter"] * 2 * WORLDS * STEPS > 0
-        with train(tmp_path, "--resume", f"--max_iterations={state['iter'] + 2}") as process:
-            output = process.communicate()[0]
-        assert process.returncode == 0 and "start anew" not in output, output
-        (file,) = tmp_path.glob(f"a1_position/*/model_{state['iter'] + 2}.pt")
-        resumed = torch.load(file, weights_only=True)
-        assert resumed["infos"]["total_timesteps"] == (state["iter"] + 2) * 2 * WORLDS * STEPS
+    last = max(run.glob("model_*.pt"), key=lambda file: int(file.stem.split("_")[1]))
+    state = torch.load(last, weights_only=True)
+    assert state["infos"]["total_timesteps"] == state["iter"] * 2 * WORLDS * STEPS > 0
+    status, output, others = train_and_end(tmp_path, signal.SIGKILL, "--resume")
+    assert (status, others) == (-signal.SIGKILL, 1) and "start anew" not in output
+    first = re.search(r"^iteration (\d+) of \d+, .*?; steps ([\d,]+)", output, flags=re.MULTILINE)
+    assert int(first[1]) == state["iter"] + 1 and int(first[2].replace(",", "")) == int(first[1]) * 2 * WORLDS * STEPS
 
 
 @pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])
