@@ -111,8 +111,9 @@ def test_videos_in_tensorboard(tmp_path):
             writer.append_data(np.full((64, 96, 3), 40 * number, np.uint8))
     for iterations in (7, 9):
         video.show_in_tensorboard(file, iterations)
-    events = EventAccumulator(str(tmp_path)).Reload().Images("video")
-    assert [(event.step, event.width, event.height) for event in events][-1] == (9, 48, 32)
+    events = EventAccumulator(str(tmp_path)).Reload().Images("video")  # in the order of their files' names
+    events = sorted(events, key=lambda event: event.step)
+    assert (events[-1].step, events[-1].width, events[-1].height) == (9, 48, 32)
     picture = Image.open(io.BytesIO(events[-1].encoded_image_string))
     assert (picture.format, picture.n_frames, picture.info["duration"]) == ("GIF", 3, 80)
     picture.seek(2)
