@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-MAX_PROCESSES = 8  # that this module starts: each holds half a gigabyte of memory
+MAX_PROCESSES = 8  # that this module starts: each holds 0.7 GB of memory
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
 
 
@@ -117,7 +117,7 @@ def average(tensors: list[Tensor]) -> None:
 
 
 def _sum_on_cpu(values: Tensor) -> None:
-    """Replace a tensor by its sum over all processes; for two of them a fifth of the time of gloo's all_reduce."""
+    """Replace a tensor by its sum over all processes; gloo's all_reduce takes longer for two of them."""
     import torch
 
     if rank() > 0:

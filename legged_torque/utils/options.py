@@ -70,7 +70,7 @@ class Options:
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
     max_iterations: Count | None = _option(
-        "iterations in all, with those before a resume; default: 110e6 environment steps, on a CPU 12e6"
+        "iterations in all, with those before a resume; default: 110e6 environment steps, on a CPU 15e6"
     )
 
     def __post_init__(self) -> None:
