@@ -5,6 +5,9 @@ from support.reproducible import content, differences, finish, start
 
 SMALL = ["--task=a1_torque_multihead", "--num_envs=256", "--perturbation=low", "--set=runner.num_steps_per_env=8"]
 SMALL += ["--set=algorithm.num_mini_batches=2", "--set=runner.save_interval=2"]
+SMALL += ["--set=motors.chain=[delay,drive,ideal,lag,urdf,friction,thermal]", "--set=motors.drive.damping=0.2"]
+SMALL += ["--set=motors.lag.time_constant=0.003", "--set=motors.friction.coulomb_friction=0.2"]
+SMALL += ["--set=motors.thermal.continuous_torque=8", "--set=motors.thermal.time_constant=1"]
 EVALUATED = ["--set=evaluation.interval=1", "--set=evaluation.also=[high]", "--set=evaluation.also_from=4096"]
 EVALUATED += ["--set=evaluation.num_samples=2048", "--set=evaluation.num_envs=128"]
 UNSEEN = ["--set=evaluation.interval=0"]
@@ -41,3 +44,21 @@ def test_evaluation_changes_nothing(trained):
     """Evaluations do not change a training: only the worlds of the evaluation are missing without them."""
     names = differences(trained["whole"], trained["unseen"])
     assert [name for name in names if not name.startswith("evaluations")] == ["checkpoint.infos.worlds"]
+
+
+def test_flashsac(device, tmp_path):
+    """FlashSAC repeats to the bit: again, without CUDA graphs, and stopped and resumed with its replay."""
+    words = ["--task=a1_position", "--preset=flashsac", "--num_envs=64", f"--device={device}", *UNSEEN]
+    words += ["--set=flashsac.buffer_min_length=512", "--set=flashsac.replay_buffer_size=4096"]
+    words += ["--set=flashsac.learning_rate_end=3e-4", "--set=flashsac.save_replay=true"]
+    words += ["--set=flashsac.mini_batch_size=64", "--set=flashsac.updates_per_step=1"]
+    graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
+    for name, capture in graphs.items():
+        iterations = f"--max_iterations={3 if name == 'stopped' else 6}"
+        parts.append(start(tmp_path / name, *words, iterations, f"--set=runner.capture={capture}"))
+    finish(*parts)
+    finish(start(tmp_path / "stopped", f"--device={device}", "--resume", "--max_iterations=6"))
+    whole, *others = (content(tmp_path / name) for name in graphs)
+    for values in (whole, *others):
+        values.pop("checkpoint.infos.worlds")  # the digest of a file, whose layout differs after loading
+    assert [differences(whole, other) for other in others] == [[], [], []]
