@@ -1,28 +1,23 @@
 """Settings changed by the command line: overrides, options, presets, and which of them wins."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.task_registry import num_iterations
 
+TABLES = yaml.safe_load(Path(__file__).with_name("config.yaml").read_text("utf-8"))
+
 
 @pytest.mark.parametrize(
     ("path", "text", "value"),
-    [
-        ("rewards.scales.torques", "-1e-4", -1e-4),
-        ("rewards.curriculum.tracking_lin_vel.t_end", "1e6", 1_000_000),
-        ("commands.ranges.lin_vel_x", "[-2, 1e-1]", [-2.0, 0.1]),
-        ("asset.penalize_contacts_on", "[calf, 'thigh']", ["calf", "thigh"]),
-        ("asset.foot_name", "1e3", "1e3"),
-        ("actor.hidden_dims", "[64, 32]", [64, 32]),
-        ("seed", "017", 17),
-        ("actor.distribution_cfg.init_std", "2", 2.0),
-    ],
+    TABLES["overrides"],
 )
 def test_overrides(path, text, value):
     """``--set`` changes the one entry that its path leads to, in the type that the entry has."""
@@ -39,36 +34,11 @@ def test_overrides(path, text, value):
 
 @pytest.mark.parametrize(
     ("item", "message"),
-    [
-        (
-            "rewards.scales.torqes=1",
-            "key 'rewards.scales.torqes'; did you mean 'rewards.scales.torques'? allowed: rewards",
-        ),
-        ("init_state.default_joint_angles.FR_hip=0", "did you mean 'init_state.default_joint_angles.FR_hip_joint'?"),
-        ("rewards.scales=1", "config key 'rewards.scales' is a section with entries"),
-        ("env.num_envs", "--set takes KEY=VALUE, not 'env.num_envs'"),
-        ("commands.ranges.lin_vel_x=[a, 1]", "commands.ranges.lin_vel_x[0] must be a number, not 'a'"),
-        ("env.num_envs=[4", "the value '[4' is not valid YAML"),
-    ],
+    TABLES["mistakes"],
 )
 def test_bad_overrides(item, message):
     """One line names the entry, what it takes and what was given."""
     assert message in error_of(get_cfgs, f"--set={item}")
-
-
-TABLE_II = {
-    "algorithm.learning_rate": 1e-4,
-    "algorithm.gamma": 0.99,
-    "algorithm.num_learning_epochs": 5,
-    "algorithm.lam": 0.9,
-    "algorithm.clip_param": 0.1,
-    "algorithm.entropy_coef": 5e-4,
-    "algorithm.max_grad_norm": 5.0,
-    "algorithm.schedule": "fixed",
-    "runner.num_steps_per_env": 2000,
-    "runner.total_steps": 110_000_000,
-    "actor.distribution_cfg.init_std": 1.0,
-}
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -81,7 +51,7 @@ def test_paper_preset_is_table_ii(task, device, monkeypatch):
         monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     env_cfg, train_cfg = task_registry.get_cfgs(task, args)
     assert env_cfg.env.num_envs == 16
-    assert {path: get(train_cfg, path) for path in TABLE_II} == TABLE_II
+    assert {path: get(train_cfg, path) for path in TABLES["Table II"]} == TABLES["Table II"]
     assert 16 * 2000 / train_cfg.algorithm.num_mini_batches == 1000
     assert num_iterations(SimpleNamespace(num_envs=16), train_cfg) == 3438  # 110e6 / 32000 = 3437.5
 
