@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from support.point_masses import make_trainer
+from support.point_masses import assert_holds_points, make_trainer
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -36,12 +36,7 @@ def test_it_learns_to_hold_point_masses():
     torch.manual_seed(0)
     faster = ("flashsac.learning_rate_peak=1e-3", "flashsac.critic_target_update_tau=0.05")
     trainer = make("flashsac.critic.num_bins=51", *faster)
-    trainer.learn(60, init_at_random_ep_len=True)
-    x = torch.linspace(-1.0, 1.0, 9)[:, None]
-    with torch.no_grad():
-        for _ in range(15):
-            x = x + 0.2 * trainer.alg.policy()({"policy": x})
-    assert float(x.abs().max()) < 0.15
+    assert_holds_points(trainer)
 
 
 def test_losses():

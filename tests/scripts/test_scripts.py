@@ -145,3 +145,12 @@ def test_train_stop_resume_play(tmp_path):
     for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
         assert math.isfinite(float(re.search(rf"^\s*{name}\s+(\S+)", output, re.MULTILINE).group(1)))
     assert re.match(r"no video: .+", output.splitlines()[-1])  # see test_packaging.py for one
+
+
+def test_info(tmp_path):
+    """Versions, device, the folder of kernels, and renderers; nothing is written."""
+    status, output, _ = run_here("info.py", root=tmp_path)
+    assert status == 0 and f"  torch          {torch.__version__}\n" in output and "compiled kernels: " in output
+    for title in ("versions", "machine", "GPU", "caches", "extras", "rendering"):
+        assert f"\n{title}\n  " in output
+    assert not list(tmp_path.iterdir())
