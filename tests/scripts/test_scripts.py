@@ -7,11 +7,11 @@ import os
 import re
 import signal
 import subprocess
-import sys
 
 import torch
 import yaml
 from support.clock import wait_for
+from support.quick_kernels import COMMAND, PATHS
 from support.scripts import ROOT, SMALL, run_here
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -21,8 +21,8 @@ from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 def start(script, *words, root, modules=ROOT):
     """Start a script in the folder ``root``, a process of its own without what the tests have set for themselves."""
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
-    environment |= {"PYTHONUNBUFFERED": "1", "PYTHONPATH": f"{modules}{os.pathsep}{ROOT}"}
-    command = [sys.executable, str(ROOT / "scripts" / script), *words]
+    environment |= {"PYTHONPATH": f"{modules}{os.pathsep}{PATHS['PYTHONPATH']}"}
+    command = [*COMMAND, str(ROOT / "scripts" / script), *words]
     return subprocess.Popen(
         command, cwd=root, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
