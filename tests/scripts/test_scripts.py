@@ -23,9 +23,13 @@ def start(script, *words, root, modules=ROOT):
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     environment |= {"PYTHONPATH": f"{modules}{os.pathsep}{PATHS['PYTHONPATH']}"}
     command = [*COMMAND, str(ROOT / "scripts" / script), *words]
-    return subprocess.Popen(
-        command, cwd=root, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
+    try:
+        return subprocess.Popen(
+            command, cwd=root, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def finish(process):
