@@ -4,6 +4,7 @@ import dataclasses
 import re
 import shutil
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,21 +26,7 @@ from legged_torque.motors.config import MotorCfg
 from legged_torque.motors.motor import Motor
 from legged_torque.motors.twin import MotorTwin
 
-CHANGED = {
-    "env.history_length": 3,
-    "control.stiffness": 35.0,
-    "control.damping": 1.5,
-    "control.action_scale": 0.5,
-    "control.torque_scale": 7.0,
-    "control.decimation": 2,
-    "sim.dt": 0.004,
-    "normalization.clip_actions": 0.2,
-    "normalization.clip_observations": 1.5,
-    "normalization.obs_scales.lin_vel": 1.7,
-    "normalization.obs_scales.ang_vel": 0.6,
-    "normalization.obs_scales.dof_pos": 0.8,
-    "normalization.obs_scales.dof_vel": 0.3,
-}
+CHANGED = yaml.safe_load(Path(__file__).with_name("export.yaml").read_text("utf-8"))["changed"]
 """Settings that all differ from what they are by default."""
 ONCE = {"control.refresh_torques": False}
 SETTINGS = {

@@ -29,23 +29,6 @@ def to_steps(task, total_steps):
     task.update_curriculum()
 
 
-def test_curriculum_with_multi_head(make_task):
-    """Torques are eq. 7 with a PD part that fades to 0; rewards have the nominal pose's, with its own weights."""
-    task = make_task(CURRICULUM, 3)
-    to_steps(task, 25_000_000)
-    q, qd, action = random_state(task)
-    expected = 0.5008 * pd_by_hand(action[:, :12], q, qd) + 4.0 * action[:, 12:]
-    np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), expected, rtol=1e-4, atol=1e-4)
-    reward = np.exp(-0.5 * np.square(q - NOMINAL).sum(axis=1))
-    np.testing.assert_allclose(task._reward_nominal_position(), reward, rtol=1e-4)
-    place = task.reward_names.index("nominal_position")
-    for total_steps, weight in ((0, 20.0), (2_500_000, 10.5), (5_000_000, 1.0), (50_000_000, 1.0)):
-        to_steps(task, total_steps)
-        assert task.reward_weights()[place].item() == pytest.approx(0.02 * weight)
-    tracking = task.cfg.rewards.curriculum.tracking_lin_vel
-    assert (tracking.t_start, tracking.t_end) == (3_000_000, 13_000_000)
-
-
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 60_000_000])
 def test_actions_for_torques(make_task, total_steps):
     """At every weight of the PD part it gives nothing, and the torque part gives the wanted torques."""

@@ -68,7 +68,9 @@ def test_decaying_bias(make_task):
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 50_000_000, 60_000_000])
-@pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
+@pytest.mark.parametrize(
+    ("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1), ("a1_torque_curriculum_multihead", 0.0)]
+)
 def test_multi_head_torques(make_task, name, end, total_steps):
     """Multi-head control is eq. 7: the PD part of the first 12 actions by its weight, plus the whole torque part."""
     task = make_task(name, 3)

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_torque.utils.runs import checkpoint_numbers
 
+TABLES = yaml.safe_load(Path(__file__).with_name("mistakes.yaml").read_text("utf-8"))
 WATCHED = """
 import runpy, sys
 import torch
@@ -127,16 +129,7 @@ def test_dry_run(name, cells, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [
-        ({"sed": [1]}, "unknown experiment key 'sed'; did you mean 'seeds'?"),
-        ({"seeds": [-1]}, "seed must be at least 0"),
-        ({"environments": {"lo": ["low"]}}, "unknown perturbation 'lo'; did you mean 'low'?"),
-        ({"train": {"runner.total_step": 1}}, "config key 'runner.total_step'; did you mean 'runner.total_steps'?"),
-        ({"train": {"env.num_actions": 5}}, "train.env.num_actions cannot be set: it comes from tasks"),
-        ({"train": {"asset.file": "missing.xml"}}, "cannot load the robot 'missing.xml': there is no such file"),
-        ({"grounds": {"levels": [0, 1.5]}}, "a level must be from 0 to 1, not 1.5"),
-        ({"evaluation": {"num_steps": 0}}, "evaluation.num_steps must be at least 1, not 0"),
-    ],
+    TABLES["file"],
 )
 def test_mistakes_in_the_file(change, message, tmp_path):
     """A key, name or value that makes no sense is refused in one line with exit status 2, and nothing is written."""
@@ -148,15 +141,7 @@ def test_mistakes_in_the_file(change, message, tmp_path):
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [
-        ([], "the following arguments are required: file"),
-        (["nothing.yaml"], "there is no file 'nothing.yaml'"),
-        (["experiments/papr.yaml"], "unknown file 'experiments/papr.yaml'; did you mean 'experiments/paper.yaml'?"),
-        (["{file}", "--job=2"], "unknown option '--job'; did you mean '--jobs'?"),
-        (["{file}", "--device=cpu", "--mps"], "--mps is for GPUs, and this experiment would run on the CPU"),
-        (["{file}", "--device=cuda:99"], "there is no device 'cuda:99'"),
-        (["{broken}"], "is not valid YAML"),
-    ],
+    TABLES["command line"],
 )
 def test_mistakes_in_the_command_line(words, message, tmp_path):
     """They are refused in one line, too."""

@@ -1,11 +1,13 @@
 """Robots from published URDF and MJCF files, up to a robot that stands and trains."""
 
 import runpy
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
 import torch
+import yaml
 from support.published import as_menagerie, as_mjcf, urdf
 
 from legged_torque.envs import task_registry
@@ -20,6 +22,19 @@ from legged_torque.motors.config import by_joint
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.standing import hold_pose
+
+FILES = yaml.safe_load(Path(__file__).with_name("files.yaml").read_text("utf-8"))
+MOTOR = '<motor joint="FL_calf" ctrlrange="-3 3" gear="6" ctrllimited="true"/>'
+
+
+def text_of(entry):
+    """The text of an entry of :data:`FILES`."""
+    if "text" in entry:
+        return entry["text"]
+    text = {"urdf": urdf, "mjcf": lambda: as_mjcf(entry.get("more", ""))}[entry["source"]]()
+    for words in entry.get("replace", ()):
+        text = text.replace(*words)
+    return text
 
 
 @pytest.fixture
@@ -145,60 +160,12 @@ def test_rotors_of_motors(written):
     assert seen[1] == pytest.approx(seen[0]) and model.actuator("FL_calf").ctrlrange[1] == 18 + 6
 
 
-MOTOR = '<motor joint="FL_calf" ctrlrange="-3 3" gear="6" ctrllimited="true"/>'
-FILTER = '<general joint="FL_calf" ctrlrange="-9 18" ctrllimited="true" dyntype="filter" dynprm="0.05"/>'
-BALL = '<geom type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05"/>'
-IN_PAIR = '<geom name="ball" type="sphere" size="0.02" pos="0 0 -0.2" mass="0.05" contype="0" conaffinity="0"/>'
-PAIR = '<contact><pair geom1="ball" geom2="ground"/></contact><actuator>'
-WORLD, LYING = "<worldbody>", "0 0 0.05 1 0 0 0 " + "2.6 -2.6 " * 4
-BODIES = '<body name="target" mocap="true"/><body name="ball"><freejoint/><geom size="0.1"/></body>'
-FRAME = '<link name="footprint"/><joint name="f" type="fixed"><parent link="footprint"/><child link="base"/>'
-TRAPS = {
-    "fixed trunk": (as_mjcf("").replace("<freejoint/>", ""), "floats now"),
-    "no gravity": (as_mjcf("").replace("<worldbody>", '<option gravity="0 0 0"/><worldbody>'), "contacts and options"),
-    "other bodies": (as_mjcf("").replace(WORLD, WORLD + BODIES), "no parts of the robot, left out: 'target', 'ball'"),
-    "mocap last": (as_mjcf("").replace("</worldbody>", '<body mocap="true"/></worldbody>'), "no parts of the robot"),
-    "moon": (as_mjcf("").replace(WORLD, f'<option gravity="0 0 -1.62"/>{WORLD}'), "not the file's [0.0, 0.0, -1.62]"),
-    "water": (as_mjcf("").replace(WORLD, f'<option density="1000"/>{WORLD}'), "left out: density"),
-    "polynomial": (as_mjcf("").replace('axis="0 1 0"', 'axis="0 1 0" damping="0.1 0.2"'), "left out: polynomial terms"),
-    "damped trunk": (as_mjcf("").replace("<freejoint/>", '<joint type="free" damping="1"/>'), "left out: damping, arm"),
-    "lying": (as_mjcf(f'<keyframe><key name="home" qpos="{LYING}"/></keyframe>'), "not the nominal pose: the keyframe"),
-    "joint without motor": (as_mjcf("").replace(MOTOR, ""), "as every joint must have one: FL_calf"),
-    "dynamics": (as_mjcf("").replace(MOTOR, FILTER), "left out: the dynamics of actuators"),
-    "uneven": (as_mjcf("").replace(MOTOR, FILTER), "differ by direction are the smaller of both: FL_calf"),
-    "feet in pairs": (
-        as_mjcf("")
-        .replace(BALL, IN_PAIR, 1)
-        .replace("</worldbody>", '<geom name="ground" type="plane" size="0 0 1"/></worldbody>')
-        .replace("<actuator>", PAIR),
-        "contacts and options",
-    ),
-    "frame": (
-        urdf().replace('name="dog">', f'name="dog">{FRAME}<origin xyz="0 0 0.3"/></joint>'),
-        "no more than a frame",
-    ),
-    "faces along y": (
-        urdf().replace('"1 0 0"', '"X"').replace('"0 1 0"', '"1 0 0"').replace('"X"', '"0 1 0"'),
-        "turn the file, x is forwards",
-    ),
-    "pose at a limit": (urdf().replace('"-2.6" upper="-0.5"', '"-2.6" upper="-1.50049"'), "contacts and options"),
-    "no speed limits": (urdf().replace('velocity="15"', 'velocity="1000"'), "no speed limits that mean anything: 20"),
-    "joint without name": (
-        as_mjcf("").replace(MOTOR, "").replace('<joint name="FL_calf"', "<joint"),
-        "the joint of 'FL_calf' had no name: 'FL_calf_joint'",
-    ),
-    "geoms of one name": (
-        as_mjcf("").replace(BALL, BALL * 2).replace('body name="FL_thigh"', 'body name="FL_calf_2"'),
-        "contacts and options",
-    ),
-    "two dashes": (urdf().replace("LF_KFE", "LF--KFE"), "contacts and options"),
-}
-
-
-@pytest.mark.parametrize(("source", "note"), TRAPS.values(), ids=TRAPS)
-def test_traps(written, source, note):
+@pytest.mark.parametrize("name", FILES["traps"])
+def test_traps(written, name):
     """Each is handled, with a note, and the robot stands where it stood without it."""
-    robot, model, cfg = written(source, "urdf" if "<robot" in source else "xml")
+    trap = FILES["traps"][name]
+    note, suffix = trap["note"], {"urdf": "urdf", "mjcf": "xml"}[trap["source"]]
+    robot, model, cfg = written(text_of(trap), suffix)
     assert any(note in other for other in robot.source.notes), robot.source.notes
     assert cfg.rewards.base_height_target == pytest.approx(0.33, abs=0.02)
     if "faces" not in note and "turn" not in note:
@@ -217,31 +184,10 @@ def test_pose_that_stands(written):
     assert hold_pose(data, *robot.gains(), model.actuator_ctrlrange.T, 3.0).tilt < np.radians(3)
 
 
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        (as_mjcf('<equality><joint joint1="FL_calf" joint2="FR_calf"/></equality>'), "equalities"),
-        (as_mjcf("").replace('axis="0 1 0"', 'axis="1 0 0"'), "no joint turns about y"),
-        (as_mjcf("").replace('pos="0 0 -', 'pos="0 0 ').replace("0 -0.15", "0 0.15"), "z must point upwards"),
-        (urdf().replace("<robot", '<robot xmlns:xacro="http://ros.org"><xacro:leg/></robot><!--', 1) + "-->", "xacro"),
-        (
-            as_mjcf("")
-            .replace("/><worldbody>", '/><asset><mesh name="m" file="gone.stl"/></asset><worldbody>')
-            .replace('angle="radian"', 'angle="radian" inertiafromgeom="true"')
-            .replace(
-                BALL, f'{BALL}<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/><geom type="mesh" mesh="m"/>', 1
-            ),
-            "the inertia of 'FL_calf' follows from the mesh 'gone.stl'",
-        ),
-        (urdf().replace('<mass value="6"/>', '<mass value="1e30"/>'), "it weighs 1e.30 kg, at most 10000 make sense"),
-        ("<mujoco><worldbody/></mujoco>", "must have joints, not 0"),
-        ("<mujoco", "unclosed token"),
-        (urdf().replace('velocity="15"', 'velocity="fast"'), "could not convert string to float: 'fast'"),
-    ],
-)
-def test_refusals(tmp_path, text, reason):
+@pytest.mark.parametrize("entry", FILES["refusals"], ids=lambda entry: entry["reason"])
+def test_refusals(tmp_path, entry):
     """Files that cannot become a robot are refused in one line."""
     file = tmp_path / "robot.xml"
-    file.write_text(text)
-    with pytest.raises(UserError, match=reason):
+    file.write_text(text_of(entry))
+    with pytest.raises(UserError, match=entry["reason"]):
         import_robot(file)

@@ -16,6 +16,8 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from support import quick_kernels
+from support.quick_kernels import PATHS
 from support.reproducible import differences, values
 from support.rollouts import make_ppo, record_rollout, state_of
 from support.settings import parse
@@ -143,8 +145,7 @@ def main(folder):
 
 def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
     """Start processes that find each other, two on this machine unless ``launch`` says otherwise."""
-    paths = os.pathsep.join([str(ROOT), *map(str, Path(__file__).parents[:2]), *sys.path])
-    environment = os.environ | {"PYTHONUNBUFFERED": "1", "PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+    environment = os.environ | PATHS | {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "torch.distributed.run", *launch, *map(str, words)]
     return subprocess.Popen(
         command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -287,7 +288,15 @@ def test_two_machines_without_shared_files(together, tmp_path):
     runs = tmp_path / "0" / TASK
     kept = shutil.copytree(together[0] / "kept", runs / "2026-01-01_00-00-00")
     (tmp_path / "1").mkdir()
-    words = [ROOT / "scripts" / "train.py", f"--task={TASK}", "--device=cpu", "--logger=none", "--verbose", "--resume"]
+    words = [
+        quick_kernels.__file__,
+        ROOT / "scripts" / "train.py",
+        f"--task={TASK}",
+        "--device=cpu",
+        "--logger=none",
+        "--verbose",
+        "--resume",
+    ]
     words += [f"--max_iterations={FOREVER}", "--set=runner.save_interval=1"]
     with contextlib.ExitStack() as stack:
         first, second = (

@@ -11,6 +11,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
+from support.quick_kernels import COMMAND, PATHS
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
@@ -29,8 +30,8 @@ def train_and_end(folder, number, *words):
     Returns:
         Exit status of the first process, what all have printed, and how many others there were.
     """
-    command = [sys.executable, ROOT / "scripts" / "train.py", *SMALL, f"--log_root={folder}", *words]
-    environment = os.environ | {"OMP_NUM_THREADS": "2", "PYTHONUNBUFFERED": "1"}
+    command = [*COMMAND, ROOT / "scripts" / "train.py", *SMALL, f"--log_root={folder}", *words]
+    environment = os.environ | PATHS | {"OMP_NUM_THREADS": "2"}
     output, others = "", []
     with subprocess.Popen(
         command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

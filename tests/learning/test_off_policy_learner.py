@@ -4,7 +4,7 @@ import copy
 
 import torch
 from rsl_rl.modules import MLP
-from support.point_masses import PointMasses, make_trainer
+from support.point_masses import PointMasses, assert_holds_points, make_trainer
 from support.settings import error_of
 
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
@@ -98,12 +98,7 @@ def test_it_learns_to_hold_point_masses():
     """Its policy drives every point to 0, from which it was anywhere before."""
     torch.manual_seed(0)
     trainer = make_trainer(TDLearner)
-    trainer.learn(60, init_at_random_ep_len=True)
-    x = torch.linspace(-1.0, 1.0, 9)[:, None]
-    with torch.no_grad():
-        for _ in range(15):
-            x = x + 0.2 * trainer.alg.policy()({"policy": x})
-    assert float(x.abs().max()) < 0.15
+    assert_holds_points(trainer)
     assert int(trainer.env.total_steps) == 60 * 8 * 8
 
 

@@ -1,10 +1,11 @@
 """Trainings in processes of their own, and comparisons of their files."""
 
 import csv
+import os
 import subprocess
-import sys
 
 import torch
+from support.quick_kernels import COMMAND, PATHS
 from support.scripts import ROOT
 
 from legged_torque.utils.runs import find_checkpoint
@@ -15,8 +16,8 @@ TIMES = ("seconds",)
 
 def start(folder, *words):
     """Start ``train.py``; its runs lie below a folder of its own."""
-    command = [sys.executable, ROOT / "scripts" / "train.py", *words, f"--log_root={folder}", "--logger=none"]
-    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    command = [*COMMAND, ROOT / "scripts" / "train.py", *words, f"--log_root={folder}", "--logger=none"]
+    output = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "env": os.environ | PATHS}
     return subprocess.Popen(list(map(str, command)), text=True, cwd=folder.parent, **output)
 
 

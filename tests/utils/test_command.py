@@ -2,9 +2,11 @@
 
 import re
 import sys
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+import yaml
 from support.command import command, complete
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 from support.settings import error_of, get_cfgs, parse
@@ -33,15 +35,7 @@ def test_command_without_a_script():
     assert_told_in_one_line(command("trian"), "unknown command 'trian'; did you mean 'train'?")
 
 
-WORDS = {
-    "plot curves --o": ["--out"],
-    "train --task a1_torque_mul": ["a1_torque_multihead"],
-    "train --preset pap": ["paper"],
-    "play --perturbation hi": ["high", "high_frequency"],
-    "evaluate --ranges h": ["hard"],
-    "train --task a1_torque --set rewards.scales.torq": ["rewards.scales.torques="],
-    "sim2sim --terrain stairs_u": ["stairs_up"],
-}
+WORDS = yaml.safe_load(Path(__file__).with_name("completions.yaml").read_text("utf-8"))["words"]
 """What a shell offers for a command line."""
 
 

@@ -1,28 +1,23 @@
-"""Settings changed by the command line: overrides, options, presets, and which of them wins."""
+"""Settings changed by the command line and which of them wins; nested ones inherit, misspelt ones are refused."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+import yaml
 from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.config import BaseConfig, Section, section_keys, to_dict
 from legged_torque.utils.task_registry import num_iterations
+
+TABLES = yaml.safe_load(Path(__file__).with_name("config.yaml").read_text("utf-8"))
 
 
 @pytest.mark.parametrize(
     ("path", "text", "value"),
-    [
-        ("rewards.scales.torques", "-1e-4", -1e-4),
-        ("rewards.curriculum.tracking_lin_vel.t_end", "1e6", 1_000_000),
-        ("commands.ranges.lin_vel_x", "[-2, 1e-1]", [-2.0, 0.1]),
-        ("asset.penalize_contacts_on", "[calf, 'thigh']", ["calf", "thigh"]),
-        ("asset.foot_name", "1e3", "1e3"),
-        ("actor.hidden_dims", "[64, 32]", [64, 32]),
-        ("seed", "017", 17),
-        ("actor.distribution_cfg.init_std", "2", 2.0),
-    ],
+    TABLES["overrides"],
 )
 def test_overrides(path, text, value):
     """``--set`` changes the one entry that its path leads to, in the type that the entry has."""
@@ -39,36 +34,11 @@ def test_overrides(path, text, value):
 
 @pytest.mark.parametrize(
     ("item", "message"),
-    [
-        (
-            "rewards.scales.torqes=1",
-            "key 'rewards.scales.torqes'; did you mean 'rewards.scales.torques'? allowed: rewards",
-        ),
-        ("init_state.default_joint_angles.FR_hip=0", "did you mean 'init_state.default_joint_angles.FR_hip_joint'?"),
-        ("rewards.scales=1", "config key 'rewards.scales' is a section with entries"),
-        ("env.num_envs", "--set takes KEY=VALUE, not 'env.num_envs'"),
-        ("commands.ranges.lin_vel_x=[a, 1]", "commands.ranges.lin_vel_x[0] must be a number, not 'a'"),
-        ("env.num_envs=[4", "the value '[4' is not valid YAML"),
-    ],
+    TABLES["mistakes"],
 )
 def test_bad_overrides(item, message):
     """One line names the entry, what it takes and what was given."""
     assert message in error_of(get_cfgs, f"--set={item}")
-
-
-TABLE_II = {
-    "algorithm.learning_rate": 1e-4,
-    "algorithm.gamma": 0.99,
-    "algorithm.num_learning_epochs": 5,
-    "algorithm.lam": 0.9,
-    "algorithm.clip_param": 0.1,
-    "algorithm.entropy_coef": 5e-4,
-    "algorithm.max_grad_norm": 5.0,
-    "algorithm.schedule": "fixed",
-    "runner.num_steps_per_env": 2000,
-    "runner.total_steps": 110_000_000,
-    "actor.distribution_cfg.init_std": 1.0,
-}
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -81,7 +51,7 @@ def test_paper_preset_is_table_ii(task, device, monkeypatch):
         monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     env_cfg, train_cfg = task_registry.get_cfgs(task, args)
     assert env_cfg.env.num_envs == 16
-    assert {path: get(train_cfg, path) for path in TABLE_II} == TABLE_II
+    assert {path: get(train_cfg, path) for path in TABLES["Table II"]} == TABLES["Table II"]
     assert 16 * 2000 / train_cfg.algorithm.num_mini_batches == 1000
     assert num_iterations(SimpleNamespace(num_envs=16), train_cfg) == 3438  # 110e6 / 32000 = 3437.5
 
@@ -118,3 +88,134 @@ def test_number_of_worlds_suits_the_device(monkeypatch):
     args = parse()
     args.device = "auto"
     assert task_registry.get_cfgs("a1_position", args)[0].env.num_envs == 4096
+
+
+class Base(BaseConfig):
+    """What all others inherit."""
+
+    class control:
+        stiffness = 1.0
+        damping = 2.0
+
+        class mixing:
+            start = 3.0
+            end = 4.0
+
+    class rewards:
+        scale = 5.0
+
+
+class Robot(Base):
+    """A robot's settings."""
+
+    class control:
+        stiffness = 20.0
+
+        class mixing:
+            end = 40.0
+
+    class rewards:
+        scale = 6.0
+
+
+class Approach(Base):
+    """An approach's settings, with a section and a setting of its own."""
+
+    class control:
+        damping = 9.0
+
+        class ramp(Section):
+            time = 0.5
+
+        class mixing:
+            start = 30.0
+
+    class rewards:
+        scale = 8.0
+        temperature: float = 7.0
+
+
+class Both(Approach, Robot):
+    """An approach on a robot."""
+
+
+class Reverse(Robot, Approach):
+    """The same with the robot's settings first."""
+
+
+def test_sections_of_several_bases_combine():
+    """Each base contributes what it says, at every depth; the first base wins, and gives the order of entries."""
+    assert to_dict(Both()) == {
+        "control": {"stiffness": 20.0, "damping": 9.0, "mixing": {"start": 30.0, "end": 40.0}, "ramp": {"time": 0.5}},
+        "rewards": {"scale": 8.0, "temperature": 7.0},
+    }
+    assert list(to_dict(Both())["control"]) == ["stiffness", "damping", "mixing", "ramp"]
+    assert to_dict(Reverse()) == to_dict(Both()) | {"rewards": {"scale": 6.0, "temperature": 7.0}}
+    assert to_dict(Approach())["control"]["stiffness"] == to_dict(Base())["control"]["stiffness"] == 1.0
+
+
+def test_named_bases_change_nothing():
+    """legged_gym's explicit way gives the same, also where it names only one of the bases."""
+
+    class Explicit(Approach, Robot):
+        class control(Robot.control):
+            class mixing(Robot.control.mixing):
+                end = 41.0
+
+    class Short(Approach, Robot):
+        class control:
+            class mixing:
+                end = 41.0
+
+    assert to_dict(Explicit()) == to_dict(Short())
+    assert Explicit.control.damping == 9.0 and Explicit.control.mixing.start == 30.0
+
+
+MISTAKES = {
+    "class control: stifness = 1.0": "setting or section of V.control 'stifness'; did you mean 'stiffness'?",
+    "class contrl: stiffness = 1.0": "setting or section of V 'contrl'; did you mean 'control'?",
+    "class control:\n  class mixing: stat = 1.0": "of V.control.mixing 'stat'; did you mean 'start'?",
+    "control = 3": "V.control is a setting, but in Both it is a section",
+    "class rewards:\n  class scale: a = 1": "V.rewards.scale is a section, but in Both.rewards it is a setting",
+}
+
+
+@pytest.mark.parametrize("text", MISTAKES)
+def test_misspelt_names_are_refused(text):
+    """A name that no base has is reported with the nearest one, before anything is built."""
+    lines = "\n".join(f" {line}" for line in text.splitlines())
+    exec(f"class V(Both):\n{lines}", globals())  # the only way to write a class from a table
+    message = error_of(V().check)  # noqa: F821
+    assert MISTAKES[text] in message and "\n" not in message
+
+
+class Port(Both):
+    """Settings with many mistakes, in sections of both kinds and in a section of a section."""
+
+    class control(Both.control):
+        control_type = "P"
+        dampin = 1.0
+
+        class mixing(Both.control.mixing):
+            strt = 2.0
+
+    class viewer:
+        ref_env = 0
+
+    rewards = 3
+
+
+class PortAgain(Port):
+    """A variant of it with one more."""
+
+    class rewards:
+        scle = 1.0
+
+
+def test_all_mistakes_are_told_at_once():
+    """Those of bases, of nested classes with and without a base, and legged_gym's names with their successors."""
+    message = error_of(task_registry.register, "port", "no:Task", PortAgain(), PortAgain())
+    for part in ("control_type", "strt", "viewers", "TorqueRobot", "Port.rewards is a setting", "scle"):
+        assert part in message
+    assert "did you mean 'damping'?" in message and "'P'" not in message
+    assert "port" not in task_registry._tasks

@@ -44,13 +44,19 @@ LARGE, SMALL = "a_term_with_a_very_long_name", "small_term"
 TERMS = {f"Episode_Reward/{SMALL}": 1e-4} | {f"Episode_Reward/{LARGE}_{i}": -0.0311 - i for i in range(20)}
 """Numbers of rewards; the last is the largest."""
 COUNTING = """
-import time
+import threading
 from legged_torque.utils.display import Counter, Display
-with Counter("rendering, frame", 4) as counter:
+drawn = threading.Event()
+class Watched(Counter):
+    def view(self):
+        drawn.set()
+        return super().view()
+with Watched("rendering, frame", 4) as counter:
     for _ in range(4):
         counter.activity = "all is well"
         counter.add()
-    time.sleep(1.2)
+    drawn.clear()
+    assert drawn.wait(120)
     assert Display.shown is counter
     with Counter("inner", 2) as inner:  # another view would cover the first one
         inner.add()

@@ -1,9 +1,11 @@
 """Every setting says what it may be, and other values are refused by its name."""
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
+import yaml
 from support.settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
@@ -42,19 +44,7 @@ def test_no_number_may_be_anything(bad):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        *("sim.dt=0", "sim.dt=10", "control.stiffness=-1", "env.episode_length_s=1e7", "algorithm.gamma=5"),
-        *("actor.hidden_dims=[-1]", "actor.hidden_dims=[]", "algorithm.learning_rate=0", "actor.hidden_dims=[1.5]"),
-        *("domain_rand.keep_fixed=[5]", "domain_rand.foot_radius=[]", "domain_rand.foot_radius=[0.02]"),
-        *("domain_rand.gravity=[10, 9]", "domain_rand.push_velocity=null", "motors.delay.range=[0.5, 1]"),
-        *("noise.add_noise=1", "commands.resampling_probability=1.5", "sim.engine=fusedd"),
-        *("rewards.curriculum.tracking_lin_vel.t_start=20000000", "algorithm.max_learning_rate=1e-5"),
-        *("evaluation.interval=-1", "runner.save_interval=0", "seed=-1", "algorithm.schedule=adaptiv"),
-        *("domain_rand.gravity={set: [10, 9]}", "domain_rand.gravity={set: [9, 10], add: [0, 1]}"),
-        *("domain_rand.dof_damping={set: [-0.1, 0.2]}", "domain_rand.trunk_mass={scale: [-0.5, 1.0]}"),
-        *("domain_rand.keep_fixed=[gravitation]", "noise.noise_scales.dof_vel=-1", "runner.run_name=a/b"),
-        *("actor.activation=relo", "runner.logger=tensorbord", "pretraining.file=policy.pt"),
-    ],
+    yaml.safe_load(Path(__file__).with_name("limits.yaml").read_text("utf-8"))["refused"],
 )
 def test_values_without_sense(change):
     """They are refused by the name of the setting, with what is allowed."""

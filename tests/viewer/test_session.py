@@ -1,4 +1,4 @@
-"""A live session: requests take effect between steps, and mistakes do no harm."""
+"""A live session: requests take effect between steps, mistakes do no harm, and steps come in real time."""
 
 import math
 import shutil
@@ -12,6 +12,7 @@ from support.sessions import new_session
 from support.tilted import tilted
 
 from legged_torque.viewer import session as session_module
+from legged_torque.viewer.pacing import MAX_LAG, Pacer
 from legged_torque.viewer.session import AS_LOADED, SCAN_INTERVAL
 
 NUM_ENVS = 2
@@ -270,3 +271,38 @@ def test_unexpected_errors(make_session, monkeypatch, capsys):
     ask(session.push, 0.0, 1.0, count=2)
     assert session.message.is_error and "TypeError: 'NoneType'" in session.message.text
     assert len(session.history) == 3 and "Traceback" in capsys.readouterr().err
+
+
+def test_pacer_real_time():
+    """Steps come in time, however long they take, as long as that is shorter than a step."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    begun = []
+    for work in [0.005, 0.015, 0.0, 0.019] * 10:
+        pacer.wait()
+        begun.append(clock.now)
+        clock.now += work
+    assert begun == pytest.approx([100.0 + 0.02 * i for i in range(40)])
+    assert pacer.rate == pytest.approx(1.0)
+
+
+def test_pacer_behind():
+    """A short delay is caught up, a long one forgotten; a machine that is too slow never sleeps and says how slow."""
+    clock = Clock()
+    pacer = Pacer(0.02, clock, clock.sleep)
+    pacer.wait()
+    clock.now += 0.05
+    for _ in range(3):
+        pacer.wait()
+    assert clock.now == pytest.approx(100.06)
+    clock.now += 2 * MAX_LAG
+    begun = len(clock.slept)
+    pacer.wait()
+    pacer.wait()
+    assert len(clock.slept) == begun + 1  # no rush of steps
+    pacer.restart()
+    clock.slept.clear()
+    for _ in range(60):
+        pacer.wait()
+        clock.now += 0.04
+    assert not clock.slept and pacer.rate == pytest.approx(0.5)

@@ -9,11 +9,10 @@ import ctypes.util
 import importlib.util
 import io
 import os
+import re
 import shutil
 import signal
 import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -34,6 +33,8 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from support.clock import wait_for as wait
+from support.quick_kernels import COMMAND, PATHS
+from support.scripts import run_here
 from support.sessions import new_session, running
 
 from legged_torque import SCRIPTS_DIR
@@ -46,7 +47,7 @@ TIMEOUT = 90.0  # seconds that the page may take for something
 OPTIONS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--window-size=900,600"
+    "--window-size=900,600 --force-device-scale-factor=0.5"  # of four pixels one is drawn
 )
 
 
@@ -108,9 +109,25 @@ def text_of(browser):
     return browser.find_element(By.TAG_NAME, "body").text
 
 
+def simulated_time(browser):
+    """How long the robots have walked [s]."""
+    return float(re.search(r"([\d.]+) s simulated", text_of(browser))[1])
+
+
 def complaints(browser):
     """Errors that were logged since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+@contextlib.contextmanager
+def screen(browser, width, height, factor, mobile=False):
+    """Context of another screen, with a number of pixels per unit of length."""
+    size = {"width": width, "height": height, "deviceScaleFactor": factor, "mobile": mobile}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        yield
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def open_page(browser, url):
@@ -171,8 +188,8 @@ def is_orange(red, green, blue):
 
 def test_what_is_shown(opened):
     """Both robots are drawn, one of them tinted, and the panels show numbers of both."""
-    wait_for(lambda: share(opened, is_dark) > 0.01)
-    wait_for(lambda: share(opened, is_orange) > 0.01)
+    wait_for(lambda: share(opened, is_dark) > 0.005)
+    wait_for(lambda: share(opened, is_orange) > 0.005)
     text = text_of(opened)
     for words in (
         *("model_0", "companion: a1_position", "Command", "v_x [m/s]", "yaw rate [rad/s]", "gamepad", "Mixing weights"),
@@ -266,21 +283,17 @@ def test_no_curve_is_cut(opened, session):
 
 def test_phone(opened):
     """The sheet is as wide as the page; the plots, at its top, can be unfolded; both robots are above it."""
-    screen = {"width": 390, "height": 844, "deviceScaleFactor": 1, "mobile": True}
-    opened.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
-    try:
+    with screen(opened, 390, 844, 0.5, mobile=True):
         open_page(opened, opened.current_url)
         sheet = wait_for(lambda: opened.find_element(By.CSS_SELECTOR, "[style*='max-height: 60%']"))
         wait_for(lambda: sheet.size["width"] == 390)
         plots = opened.find_element(By.CSS_SELECTOR, "[aria-label='Expand panel Walking']")
         assert plots.location["y"] < opened.find_element(By.XPATH, "//label[.='random']").location["y"]
         robots = {"left": 0.0, "right": 1.0, "top": 0.15, "bottom": 0.38}
-        wait_for(lambda: share(opened, is_dark, **robots) > 0.01 and share(opened, is_orange, **robots) > 0.01)
+        wait_for(lambda: share(opened, is_dark, **robots) > 0.005 and share(opened, is_orange, **robots) > 0.005)
         click(opened, plots)
         wait_for(lambda: "v_x, forward [m/s]" in text_of(opened))
-    finally:
-        opened.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
-        open_page(opened, opened.current_url)
+    open_page(opened, opened.current_url)
 
 
 def test_recording_without_a_renderer(opened, page):
@@ -305,7 +318,7 @@ def test_rough_ground(browser, tmp_path):
         is_orange = share(browser, lambda red, green, blue: red > blue + 8, **middle) > 0.3
         return is_orange and share(browser, lambda red, green, blue: (red > 180) & (green < 90), **middle) > 0.001
 
-    with running(session), serving(session) as page:
+    with running(session), serving(session) as page, screen(browser, 900, 500, 1):  # points are a pixel large
         session.set_command((0.0, 0.0, 0.0))
         walk(session, 0.1)
         open_page(browser, page.server.url)
@@ -322,11 +335,11 @@ def test_a_video_is_downloaded(browser, tmp_path):
     """From a run to a video of it that the browser has saved."""
     train = ["--task=a1_torque_multihead", "--num_envs=2", "--max_iterations=1", "--set", "runner.num_steps_per_env=4"]
     words = ["--log_root=.", "--device=cpu"]
-    environment = {**os.environ, "MUJOCO_GL": "osmesa"}
+    environment = {**os.environ, **PATHS, "MUJOCO_GL": "osmesa"}
     how = {"cwd": tmp_path, "env": environment, "stdout": subprocess.PIPE, "text": True}
-    subprocess.run([sys.executable, SCRIPTS_DIR / "train.py", *train, *words], check=True, **how)
-    play = [sys.executable, SCRIPTS_DIR / "play.py", *train[:1], "--viewer=web", "--port=8495", *words]
-    with subprocess.Popen(play, **how) as process:
+    assert run_here("train.py", *train, *words, root=tmp_path)[0] == 0
+    play = [SCRIPTS_DIR / "play.py", *train[:1], "--viewer=web", "--port=8495", *words]
+    with subprocess.Popen([*COMMAND, *play], **how) as process:
         try:
             lines = iter(process.stdout.readline, "")
             open_page(browser, next(line for line in lines if "See it walk" in line).split()[3])
@@ -334,13 +347,18 @@ def test_a_video_is_downloaded(browser, tmp_path):
             pause = control(browser, "pause")
             click(browser, pause)
             wait_for(lambda: "paused" in text_of(browser))
-            for element, seconds in (("Record", 0.5), (pause, 2.0), (pause, 0.5), ("Stop and download", 0.5)):
-                click(browser, element)
-                time.sleep(seconds)
+            click(browser, "Record")
+            wait_for(lambda: "Stop and download" in text_of(browser))
+            start = simulated_time(browser)
+            click(browser, pause)
+            wait_for(lambda: simulated_time(browser) > start + 0.2)
+            click(browser, pause)
+            wait_for(lambda: "paused" in text_of(browser))
+            click(browser, "Stop and download")
             file = browser.downloads / "walking.mp4"
             wait_for(file.is_file)
             process.send_signal(signal.SIGINT)
-            wait_for(lambda: " ".join(play[2:]) in text_of(browser))  # how to open it again
+            wait_for(lambda: " ".join(play[1:]) in text_of(browser))  # how to open it again
         finally:
             process.send_signal(signal.SIGINT)
             process.communicate()
