@@ -282,6 +282,9 @@ def test_python(run_page):
     names = run_page("docs/howto/python.md")
     assert names["heights"][0].shape == (4,) and names["pair"].num_envs == 2
     assert 0.0 <= names["metrics"].means()["track_percentage"] <= 1.0
+    task = make("a1_decap", "control.decap.record=walk.csv")
+    task.step(torch.zeros(4, 12))
+    np.testing.assert_allclose(task.reference[0], names["angles"][0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("page", PAGES)
