@@ -173,3 +173,4 @@ def test_gains_of_the_policy(make_task, tmp_path):
     setting = write(tmp_path / "net.json", perceptron([6, 1]))
     stiffness = {"control.stiffness": {"calf": 0.0, "joint": 20.0}}
     assert "control.stiffness" in error_of(make_task, "a1_torque", 2, **setting, **CHAIN, **stiffness)
+    assert "network" in error_of(make_task, "a1_variable_stiffness", 2, **setting, **CHAIN)

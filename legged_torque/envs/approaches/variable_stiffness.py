@@ -10,6 +10,8 @@ from legged_torque.envs.approaches.variable_stiffness_config import VariableStif
 from legged_torque.envs.base.actions import ActionTerm
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.observations import ObservationTerm
+from legged_torque.motors.model_config import NetworkCfg
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import Mirroring
 
 
@@ -32,7 +34,10 @@ class VariableStiffnessRobot(LeggedRobot):
         self._means = is_same / is_same.sum(dim=0)
 
     def action_terms(self) -> list[ActionTerm]:
-        """Return a position residual and a change of the stiffness per joint."""
+        """Return a position residual and a change of the stiffness per joint; a UserError if a motor is a network."""
+        motors = self.cfg.motors
+        if any(isinstance(getattr(motors, name, None), NetworkCfg) for name in motors.chain):
+            raise UserError("motors.chain: a network is of a drive with fixed gains, which this task's policy changes")
         scale, meaning = self.control.action_scale, "joint position relative to nominal_pose, for PD control"
         stiffness = torch.full_like(scale, self.cfg.control.stiffness_scale)
         return [
