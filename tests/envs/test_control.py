@@ -36,7 +36,8 @@ def test_torque_torques(make_task, name):
 @pytest.mark.parametrize("group", ["leg", "joint"])
 def test_variable_stiffness_torques(make_task, group):
     """Kp is 20 and 5 per unit of action, the leg's mean or the joint's own, from 10 to 60; Kd is 0.2 sqrt(Kp)."""
-    task = make_task("a1_variable_stiffness", 3, **{"control.stiffness_of": group})
+    settings = {"control.stiffness_of": group, "control.decimation": 1}
+    task = make_task("a1_variable_stiffness", 3, **settings, **IN_THE_AIR)
     q, qd, action = random_state(task)
     change = 4.0 * action[:, 12:]
     action[:, 12:] = change
@@ -46,9 +47,14 @@ def test_variable_stiffness_torques(make_task, group):
     assert kp.min() == 10.0 and kp.max() > 25.0
     expected = kp * (NOMINAL + 0.25 * action[:, :12] - q) - 0.2 * np.sqrt(kp) * qd
     np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), expected, rtol=1e-4, atol=1e-4)
+    if group == "leg":  # in the physics kernel, too
+        task.step(torch.tensor(action).float())
+        np.testing.assert_allclose(task.torques, np.clip(expected, -TORQUE_LIMIT, TORQUE_LIMIT), rtol=1e-4, atol=1e-4)
+        assert not task.notes
     hips, others = list(range(0, 12, 3)), [i for i in range(12) if i % 3]
     image = task.mirror("actions", torch.ones(1, 24))[0].numpy()
     assert (image[hips] == -1.0).all() and (image[others] == 1.0).all() and (image[12:] == 1.0).all()
+    np.testing.assert_array_equal(task.mirror("policy", torch.ones(1, 57))[0, 33:], image)  # as last action
 
 
 def test_decaying_bias(make_task):
