@@ -199,7 +199,7 @@ def test_motor(run_page):
     names, network = run_page("docs/howto/motor.md"), torch.nn.Sequential(torch.nn.Linear(6, 8), torch.nn.Softsign())
     network.append(torch.nn.Linear(8, 1))
     torch.jit.script(network).save("net.pt")
-    names["convert"]("net.pt", "net.json")
+    names["convert"]("net.pt", "net.json", "softsign")
     chain = ["motors.chain=[network]", "motors.network.file=net.json", "motors.network.velocity_scale=0.1"]
     driven = make("a1_position", "init_state.pos=[0, 0, 50]", "control.decimation=1", *chain)
     error, vel = driven.default_dof_pos - driven.dof_pos, 0.1 * driven.dof_vel
