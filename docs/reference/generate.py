@@ -38,7 +38,7 @@ from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder")
+LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder", "Network")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
 SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors.", "FlashSACCfg": "flashsac."}
 """Where the settings of some classes stand."""

@@ -1,8 +1,8 @@
 """Formulas of motor models, each once for torch and numpy; :mod:`legged_torque.motors.models` has them as kernels.
 
 ``xp`` is the module of the arrays. ``motor`` has, by name, the constants of the model, what it keeps from step to step,
-and ``dt`` [s], ``decimation``, ``nominal_pose`` [rad] and ``highest_torque`` [N m] of the robot. Arrays have the shape
-(num_dof,) or (num_envs, num_dof).
+and ``dt`` [s], ``decimation``, ``nominal_pose`` [rad], ``highest_torque`` [N m], ``p_gains`` [N m/rad] and ``d_gains``
+[N m s/rad] of the robot. Arrays have the shape (num_dof,) or (num_envs, num_dof).
 """
 
 from collections.abc import Callable
@@ -121,6 +121,37 @@ def encoder(xp: Any, motor: Any, pos: Any, vel: Any) -> tuple[Any, Any]:
     return position * xp.round(pos / position), velocity * xp.round(vel / velocity)
 
 
+def network(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, dict[str, Any]]:
+    """A multilayer perceptron from logs of a position drive, the same for all joints (Hwangbo et al., 2019).
+
+    Inputs as of IsaacLab's ``ActuatorNetMLP``: errors of the target, ``position_scale`` (target - pos), as many physics
+    steps ago as ``history`` says, 0 before an episode; then ``velocity_scale`` vel likewise. The output times
+    ``torque_scale`` is the torque [N m].
+
+    What comes in are torques, so the target is the one at which PD control with the robot's gains asks for them: target
+    - pos = (wanted + d_gains vel) / p_gains. For a position task this is the policy's target, whatever the gains are; a
+    drawn strength of the motors multiplies what is asked for. A torque task needs the gains of the logged drive.
+    """
+    error = (wanted + motor.d_gains * vel) / motor.p_gains
+    newest = xp.stack([motor.position_scale * error, motor.velocity_scale * vel], axis=-1)
+    seen = xp.concatenate([newest[..., None], motor.seen[..., :-1]], axis=-1)
+    values = xp.stack([seen[..., age] for age in motor.history], axis=-1).reshape(*wanted.shape, -1)
+    activation = ACTIVATIONS[motor.activation]
+    for number, layer in enumerate(motor.layers):
+        values = (activation(xp, values) if number else values) @ layer[:, :-1].T + layer[:, -1]
+    return motor.torque_scale * values[..., 0], {"seen": seen}
+
+
+ACTIVATIONS: dict[str, Callable[[Any, Any], Any]] = {
+    "softsign": lambda xp, x: x / (1.0 + xp.abs(x)),
+    "tanh": lambda xp, x: xp.tanh(x),
+    "relu": lambda xp, x: xp.clip(x, 0.0, None),
+    "elu": lambda xp, x: xp.where(x > 0.0, x, xp.expm1(xp.clip(x, None, 0.0))),
+    "softplus": lambda xp, x: xp.clip(x, 0.0, None) + xp.log1p(xp.exp(-xp.abs(x))),
+}
+"""Activations of :func:`network` by name, between its layers."""
+
+
 def _approach(xp: Any, dt: Any, time_constant: Any) -> Any:
     """Return the share of the way to a constant input that a first-order lag goes in ``dt`` [s]."""
     return 1.0 - xp.exp(-dt / xp.clip(time_constant, SMALL, None))
@@ -133,6 +164,7 @@ class Formula:
     function: Callable[..., tuple[Any, Any]]  # (xp, motor, wanted, pos, vel) -> torques [N m], new state by name
     state: tuple[str, ...] = ()  # names of arrays, 0 at the start of an episode
     begin: Callable[..., dict[str, Any]] | None = None  # (xp, motor) -> new state, before a control step
+    inner: Callable[[Any], tuple[int, ...]] = lambda motor: ()  # further axes of this state
     is_encoder: bool = False  # whether the function is (xp, motor, pos, vel) -> both as they are measured
 
 
@@ -146,5 +178,6 @@ FORMULAS = {
     "quantize": Formula(quantize),
     "muscle": Formula(muscle, ("activation", "fatigue")),
     "encoder": Formula(encoder, is_encoder=True),
+    "network": Formula(network, ("seen",), inner=lambda motor: (2, max(motor.history) + 1)),
 }
 """The formulas by name, as ``policy.yaml`` has it under ``model``."""

@@ -19,6 +19,7 @@ class Joints:
     dt: float  # physics step [s]
     decimation: int  # physics steps per control step
     nominal_pose: Tensor  # [rad]. Shape: (num_dof,)
+    gains: tuple[Tensor, Tensor]  # Kp [N m/rad] and Kd [N m s/rad] of PD control. Shapes: (num_envs, num_dof)
     section: str = "motors"  # path of the settings of the link that is built
 
     @property

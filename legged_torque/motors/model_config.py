@@ -1,13 +1,15 @@
 """Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
+from legged_torque import resource_path
 from legged_torque.motors.config import DelayCfg, MotorCfg, by_joint
-from legged_torque.utils.config import Section, section_keys, to_dict
+from legged_torque.utils.config import Section, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import DrawLimits, Interval, Limits
+from legged_torque.utils.files import read_data
+from legged_torque.utils.limits import DrawLimits, Interval, Limits, Positive
 
 PerJoint = Annotated[float | dict[str, float], Limits(lowest=0)]
 PositivePerJoint = Annotated[float | dict[str, float], Limits(above=0)]
@@ -15,6 +17,8 @@ SharePerJoint = Annotated[float | dict[str, float], Limits(0, 1)]
 Draws = dict[str, Annotated[dict[Literal["set", "add", "scale"], Interval], DrawLimits()]]
 ASSUMED_VOLTAGE: Draws = {"voltage": {"set": [0.85, 1.05]}}
 """Shares of the nominal voltage that batteries are assumed to have; no source gives those of these robots."""
+
+MOST_WEIGHTS = 20_000  # of a network: settings of a run are read up to a million characters
 
 
 class ModelCfg(MotorCfg):
@@ -32,6 +36,15 @@ class ModelCfg(MotorCfg):
             if name not in names:
                 raise unknown_name(f"{path}.draws", name, names)
         return {name: by_joint(f"{path}.{name}", getattr(self, name), dof_names) for name in names}
+
+    def whole(self, array: Callable[[Any], Any], dt: float) -> dict[str, Any]:
+        """Return what the formula reads besides constants of joints, after :meth:`constants`.
+
+        Args:
+            array: Makes an array of nested lists of numbers.
+            dt: Physics step [s].
+        """
+        return {}
 
     def describe(self) -> dict[str, Any]:
         """Return model and constants for ``policy.yaml``."""
@@ -130,7 +143,61 @@ class EncoderCfg(ModelCfg):
     velocity_resolution: PositivePerJoint = 3.88e-3  # [rad/s]
 
 
-_ALL = (IdealCfg, CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg)
+class NetworkCfg(ModelCfg):
+    """Settings of :func:`~legged_torque.motors.formulas.network`, a network from logged data.
+
+    Its file is JSON, numbers and a name alone, so that nothing in it can run: ``{"activation": "softsign", "layers":
+    [...]}``. It is read once; then the settings have its contents, runs and exports with them, and ``file`` is empty.
+    """
+
+    _motor_class = "legged_torque.motors.models:NetworkModel"
+    _model, _others = "network", ("draws", "file", "step", "history", "activation", "layers")
+    file: str = ""  # absolute, below resources/, or relative to the current directory
+    activation: Literal["softsign", "tanh", "relu", "elu", "softplus"] = "softsign"  # between layers; of the file
+    layers: list[list[list[float]]] = []  # of the file; a row per output of a layer: weights, then the bias
+    history: Annotated[list[int], Limits(0, 100, nonempty=True)] = [0, 1, 2]  # ages of inputs [physics steps]
+    step: Positive = 0.005  # [s] between inputs in the logs, which must be the physics step
+    position_scale: float | dict[str, float] = 1.0  # of errors of the target; -1 for logs of pos - target
+    velocity_scale: float | dict[str, float] = 1.0  # of joint velocities
+    torque_scale: float | dict[str, float] = 1.0  # of the output
+
+    def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
+        """Return the scales; a UserError if the network cannot be read, or is of another size."""
+        self._read(path)
+        sizes = [2 * len(self.history), *map(len, self.layers)]
+        for number, (rows, inputs) in enumerate(zip(self.layers, sizes, strict=False), 1):
+            for wrong in {len(row) - 1 for row in rows} - {inputs}:
+                expected = f"{inputs} inputs" + (", two per entry of history" if number == 1 else "")
+                raise UserError(f"layer {number} of {path} must have {expected}, not {wrong}")
+        if sizes[-1] != 1 or not self.layers:
+            raise UserError(f"the last layer of {path} must have one output, the torque of a joint, not {sizes[-1]}")
+        return super().constants(dof_names, path)
+
+    def whole(self, array: Callable[[Any], Any], dt: float) -> dict[str, Any]:
+        """Return the network; a UserError if it is for another physics step."""
+        if abs(dt - self.step) > 1e-5 * self.step:
+            raise UserError(f"the network of the motors is for physics steps of {self.step:g} s (step), not {dt:g} s")
+        layers = [array(layer) for layer in self.layers]
+        return {"history": self.history, "activation": self.activation, "layers": layers}
+
+    def describe(self) -> dict[str, Any]:
+        """Return model, constants and network for ``policy.yaml``."""
+        self._read("motors.network")
+        return super().describe() | {name: getattr(self, name) for name in ("step", "history", "activation", "layers")}
+
+    def _read(self, path: str) -> None:
+        """Read the file if there is one to read; a UserError if it is no network."""
+        if self.file:
+            content = read_data(resource_path(self.file), {"activation", "layers"}, "docs/howto/motor.md")
+            update_from_dict(self, {name: content[name] for name in ("activation", "layers")}, path)
+            if sum(len(row) for layer in self.layers for row in layer) > MOST_WEIGHTS:
+                raise UserError(f"'{self.file}' must have at most {MOST_WEIGHTS} numbers, which settings can hold")
+            self.file = ""
+        elif not self.layers:
+            raise UserError(f"{path}.file must name the file of the network, see docs/howto/motor.md")
+
+
+_ALL = (IdealCfg, CurveCfg, DriveCfg, LagCfg, FrictionCfg, ThermalCfg, QuantizeCfg, MuscleCfg, EncoderCfg, NetworkCfg)
 MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 
@@ -146,6 +213,7 @@ class MotorsCfg(Section):
     thermal = ThermalCfg  # less torque after a long load
     quantize = QuantizeCfg  # steps of torques
     encoder = EncoderCfg  # steps of measurements, for policy, control law and the links before it
+    network = NetworkCfg  # a network from logged data, outside of the physics kernel
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""

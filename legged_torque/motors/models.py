@@ -13,6 +13,7 @@ from legged_torque.motors.kernel import read, struct_of
 from legged_torque.motors.model_config import ModelCfg
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.errors import UserError
 
 _SMALL = wp.constant(SMALL)
 
@@ -210,7 +211,7 @@ KERNELS = {
     "muscle": muscle_torque,
     "encoder": measured_state,
 }
-"""The Warp functions of formulas, by name."""
+"""The Warp functions of formulas, by name; a network has none, since one thread would compute all of it."""
 
 
 class ModelMotor(Motor):
@@ -225,14 +226,16 @@ class ModelMotor(Motor):
     def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
         """Lay out the constants, with a row per world for those that are drawn. Errors as of ``cfg.constants``."""
         super().__init__(cfg, joints)
-        self.formula, self.kernel = FORMULAS[cfg._model], KERNELS[cfg._model]  # type: ignore[misc]
+        self.formula, self.kernel = FORMULAS[cfg._model], KERNELS.get(cfg._model)  # type: ignore[misc]
         self.values = SimpleNamespace(dt=joints.dt, decimation=joints.decimation, nominal_pose=joints.nominal_pose)
         self.values.lowest_torque, self.values.highest_torque = joints.torque_limits
+        self.values.p_gains, self.values.d_gains = joints.gains
         for name, numbers in cfg.constants(joints.names, joints.section).items():
             rows = torch.tensor(numbers, device=self.device).expand(self.num_envs, -1)
             setattr(self.values, name, rows.clone() if name in cfg.draws else rows)
+        vars(self.values).update(cfg.whole(lambda numbers: torch.tensor(numbers, device=self.device), joints.dt))
         for name in self.formula.state:
-            setattr(self.values, name, self.buffer(name, len(joints.names)))
+            setattr(self.values, name, self.buffer(name, len(joints.names), *self.formula.inner(self.values)))
         self.lost = self._buffers.get("lost")
 
     def send(self, actions: Tensor) -> None:
@@ -259,7 +262,7 @@ class ModelMotor(Motor):
     def reset(self, mask: Tensor) -> None:
         """Forget the state of ended episodes."""
         for values in self._buffers.values():
-            values.masked_fill_(mask.unsqueeze(1), 0.0)
+            values.masked_fill_(mask.view(-1, *[1] * (values.dim() - 1)), 0.0)
 
     def random_parameters(self) -> list[RandomParameter]:
         """Return what ``draws`` names, each as one number per world."""
@@ -269,6 +272,18 @@ class ModelMotor(Motor):
             RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
             for name, draw in draws.items()
         ]
+
+
+class NetworkModel(ModelMotor):
+    """A network from logged data."""
+
+    def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
+        """Read the network; a UserError if it is of another form, or there is no target that gives its errors."""
+        if not bool((joints.gains[0] > 0.0).all()):
+            raise UserError(
+                f"{joints.section} needs a control.stiffness above 0 of all joints, to have errors of targets"
+            )
+        super().__init__(cfg, joints)
 
 
 class MuscleModel(ModelMotor):

@@ -19,7 +19,7 @@ class MotorTwin:
     """
 
     def __init__(self, description: dict[str, Any]) -> None:
-        """Read the sections ``motors``, ``joint_order``, ``torque_limits``, ``nominal_pose`` and ``timing``.
+        """Read the sections ``motors``, ``joint_order``, ``torque_limits``, ``nominal_pose``, ``gains`` and ``timing``.
 
         A UserError names a motor without a function here, and constants that make no sense.
         """
@@ -27,15 +27,16 @@ class MotorTwin:
         limits = np.array([description["torque_limits"][name] for name in names], np.float32).T
         robot = {"lowest_torque": limits[0], "highest_torque": limits[1], "decimation": timing["decimation"]}
         robot |= {"dt": np.float32(1.0 / timing["physics_frequency"])}
-        robot |= {"nominal_pose": np.array([description["nominal_pose"][name] for name in names], np.float32)}
+        by_joint = {"nominal_pose": description["nominal_pose"]}
+        by_joint |= {"p_gains": description["gains"]["stiffness"], "d_gains": description["gains"]["damping"]}
+        robot |= {key: np.array([values[name] for name in names], np.float32) for key, values in by_joint.items()}
         links = description.get("motors") or {"ideal": {"model": "ideal"}}
         self._links = []
         for link, described in links.items():
             if without_function(described):
                 raise UserError(f"no numpy function for the motor '{link}'")
-            motor, model = SimpleNamespace(**robot), described["model"]
-            vars(motor).update(_constants(described, names, f"motors.{link}"))
-            self._links.append((FORMULAS[model], motor))
+            motor = SimpleNamespace(**robot, **_constants(described, names, f"motors.{link}", robot["dt"]))
+            self._links.append((FORMULAS[described["model"]], motor))
         check_encoders("motors", [link for link, described in links.items() if described["model"] == "encoder"])
         self._shape = (len(names),)
         self.reset()
@@ -43,7 +44,8 @@ class MotorTwin:
     def reset(self) -> None:
         """Start an episode: forget what motors keep from step to step."""
         for formula, motor in self._links:
-            vars(motor).update({name: np.zeros(self._shape, np.float32) for name in formula.state})
+            shape = (*self._shape, *formula.inner(motor))
+            vars(motor).update({name: np.zeros(shape, np.float32) for name in formula.state})
 
     def begin(self) -> None:
         """Begin a control step."""
@@ -83,9 +85,10 @@ def without_function(described: dict[str, Any]) -> bool:
     return str(described.get("model")) not in FORMULAS
 
 
-def _constants(described: dict[str, Any], names: list[str], path: str) -> dict[str, np.ndarray]:
+def _constants(described: dict[str, Any], names: list[str], path: str, dt: float) -> dict[str, Any]:
     """Return constants by name; a UserError names those that do not exist or make no sense. Shapes: (joints,)."""
     cfg = MODELS[described["model"]]()
     update_from_dict(cfg, {name: value for name, value in described.items() if name != "model"}, path)
     cfg.check(path)
-    return {name: np.array(values, np.float32) for name, values in cfg.constants(names, path).items()}
+    constants = {name: np.array(values, np.float32) for name, values in cfg.constants(names, path).items()}
+    return constants | cfg.whole(np.float32, dt)

@@ -35,6 +35,8 @@ SETTINGS = {
     "torques_once": ONCE,
     "motors": REAL_MOTORS,
     "motors_once": REAL_MOTORS | ONCE,
+    "motors_network": {"motors.chain": ["network", "ideal"], "motors.network.history": [0, 2]}
+    | {"motors.network.layers": np.random.default_rng(0).normal(size=(1, 1, 5)).tolist()},
 }
 
 
@@ -59,7 +61,7 @@ def read_yaml(folder):
 
 TWO_RATES = "a1_multihead_two_rates"
 PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
-MORE_PARITY = [("a1_torque_multihead", settings) for settings in ("torques_once", "motors", "motors_once")]
+MORE_PARITY = [("a1_torque_multihead", settings) for settings in SETTINGS if settings not in ("default", "changed")]
 
 
 @pytest.mark.parametrize(("name", "settings"), [*PARITY, *MORE_PARITY])

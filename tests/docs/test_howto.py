@@ -195,8 +195,18 @@ def test_approach(run_page):
 
 
 def test_motor(run_page):
-    """The rate limit acts inside the kernel: 1.5 N m per physics step."""
-    run_page("docs/howto/motor.md")
+    """The rate limit acts inside the kernel: 1.5 N m per physics step; a network is the TorchScript file's."""
+    names, network = run_page("docs/howto/motor.md"), torch.nn.Sequential(torch.nn.Linear(6, 8), torch.nn.Softsign())
+    network.append(torch.nn.Linear(8, 1))
+    torch.jit.script(network).save("net.pt")
+    names["convert"]("net.pt", "net.json", "softsign")
+    chain = ["motors.chain=[network]", "motors.network.file=net.json", "motors.network.velocity_scale=0.1"]
+    driven = make("a1_position", "init_state.pos=[0, 0, 50]", "control.decimation=1", *chain)
+    error, vel = driven.default_dof_pos - driven.dof_pos, 0.1 * driven.dof_vel
+    driven.step(torch.zeros(4, 12))
+    past = torch.zeros(4, 12, 2)
+    expected = network(torch.cat([error[..., None], past, vel[..., None], past], dim=2))
+    torch.testing.assert_close(driven.torques, expected[..., 0].detach(), rtol=1e-4, atol=1e-4)
     task = make("a1_slew", "init_state.pos=[0, 0, 50]")
     assert not task.notes
     task.step(torch.full((4, 12), 2.0))
@@ -272,6 +282,9 @@ def test_python(run_page):
     names = run_page("docs/howto/python.md")
     assert names["heights"][0].shape == (4,) and names["pair"].num_envs == 2
     assert 0.0 <= names["metrics"].means()["track_percentage"] <= 1.0
+    task = make("a1_decap", "control.decap.record=walk.csv")
+    task.step(torch.zeros(4, 12))
+    np.testing.assert_allclose(task.reference[0], names["angles"][0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 import torch
 from support.control import CONVERGED, IN_THE_AIR, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
+from support.episodes import time_out
+from support.settings import error_of
 
 
 def theta_by_hand(total_steps, end):
@@ -34,7 +36,8 @@ def test_torque_torques(make_task, name):
 @pytest.mark.parametrize("group", ["leg", "joint"])
 def test_variable_stiffness_torques(make_task, group):
     """Kp is 20 and 5 per unit of action, the leg's mean or the joint's own, from 10 to 60; Kd is 0.2 sqrt(Kp)."""
-    task = make_task("a1_variable_stiffness", 3, **{"control.stiffness_of": group})
+    settings = {"control.stiffness_of": group, "control.decimation": 1}
+    task = make_task("a1_variable_stiffness", 3, **settings, **IN_THE_AIR)
     q, qd, action = random_state(task)
     change = 4.0 * action[:, 12:]
     action[:, 12:] = change
@@ -44,9 +47,14 @@ def test_variable_stiffness_torques(make_task, group):
     assert kp.min() == 10.0 and kp.max() > 25.0
     expected = kp * (NOMINAL + 0.25 * action[:, :12] - q) - 0.2 * np.sqrt(kp) * qd
     np.testing.assert_allclose(task._compute_torques(torch.tensor(action).float()), expected, rtol=1e-4, atol=1e-4)
+    if group == "leg":  # in the physics kernel, too
+        task.step(torch.tensor(action).float())
+        np.testing.assert_allclose(task.torques, np.clip(expected, -TORQUE_LIMIT, TORQUE_LIMIT), rtol=1e-4, atol=1e-4)
+        assert not task.notes
     hips, others = list(range(0, 12, 3)), [i for i in range(12) if i % 3]
     image = task.mirror("actions", torch.ones(1, 24))[0].numpy()
     assert (image[hips] == -1.0).all() and (image[others] == 1.0).all() and (image[12:] == 1.0).all()
+    np.testing.assert_array_equal(task.mirror("policy", torch.ones(1, 57))[0, 33:], image)  # as last action
 
 
 def test_decaying_bias(make_task):
@@ -65,6 +73,55 @@ def test_decaying_bias(make_task):
         np.testing.assert_allclose(torques, expected, rtol=1e-4, atol=1e-4)
     imitated = np.exp(-10.0 * np.square(q - reference).sum(axis=1))
     np.testing.assert_allclose(task._reward_imitation_angles(), imitated, rtol=1e-3, atol=1e-12)
+
+
+def test_record(make_task, tmp_path):
+    """Bias and imitation follow the rows of a file from each episode's start, for 20 ms each, again and again."""
+    task = make_task("a1_decap", 3)
+    rows = NOMINAL + np.random.default_rng(0).uniform(-0.2, 0.2, (3, 12))
+    header = ",".join(task.dof_names[::-1])
+    np.savetxt(tmp_path / "walk.csv", rows[:, ::-1], delimiter=",", header=header, comments="")
+    settings = {"control.decap.record": str(tmp_path / "walk.csv"), **IN_THE_AIR}
+    once = {"control.decimation": 1, "control.refresh_torques": False}
+    for changes, per_row in [({"control.refresh_torques": False}, 1), (once, 4)]:
+        task, count = make_task("a1_decap", 3, **settings, **changes), np.zeros(3, int)
+        for step in range(9):
+            if step == 5:
+                time_out(task, [1])
+            reference, q, qd = rows[count // per_row % 3], task.dof_pos.numpy().copy(), task.dof_vel.numpy().copy()
+            task.step(torch.full((3, 12), 0.5))
+            kept = ~task.reset_buf.numpy()
+            assert kept.tolist() == [True, step != 5, True]
+            torques = 4.0 + 20.0 * (reference - q) - 0.5 * qd
+            np.testing.assert_allclose(task.torques[kept], torques[kept], rtol=1e-4, atol=1e-4)
+            imitated = np.exp(-10.0 * np.square(task.dof_pos.numpy() - reference).sum(axis=1))
+            np.testing.assert_allclose(task._reward_imitation_angles()[kept], imitated[kept], rtol=1e-3, atol=1e-6)
+            count = np.where(kept, count + 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda lines: None, ["cannot read", "walk.csv"]),
+        (
+            lambda lines: [lines[0].replace("FR_hip_joint", "FR_hips_joint"), *lines[1:]],
+            ["did you mean 'FR_hip_joint'"],
+        ),
+        (lambda lines: [line.partition(",")[2] for line in lines], ["each of these joints once", "FR_hip_joint"]),
+        (lambda lines: [*lines, "0.1,0.2"], ["not a table"]),
+        (lambda lines: [*lines, lines[1].replace("0.5", "exit()")], ["not a table", "exit()"]),
+        (lambda lines: [*lines, lines[1].replace("0.5", "nan")], ["finite"]),
+        (lambda lines: lines[:1], ["rows"]),
+        (lambda lines: [], ["not a table"]),
+    ],
+)
+def test_bad_records(make_task, tmp_path, change, words):
+    """A file that is no table of numbers, or has other joints, is refused in one line."""
+    lines = change([",".join(make_task("a1_position", 1).dof_names), ",".join(["0.5"] * 12)])
+    if lines is not None:
+        (tmp_path / "walk.csv").write_text("\n".join(lines))
+    line = error_of(make_task, "a1_decap", 1, **{"control.decap.record": str(tmp_path / "walk.csv")})
+    assert all(word in line for word in ["walk.csv", *words])
 
 
 @pytest.mark.parametrize("total_steps", [0, 25_000_000, 50_000_000, 60_000_000])

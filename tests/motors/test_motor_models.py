@@ -73,7 +73,8 @@ def joints(worlds=WORLDS):
     """Three joints on a CPU."""
     limits, actions = torch.tensor([[-PEAK] * 3, [PEAK] * 3]), torch.zeros(worlds, 3)
     pose = torch.tensor(POSE, dtype=torch.float32)
-    return Joints(NAMES, limits, torch.zeros(3), actions, DT, DECIMATION, pose, "motors.own")
+    gains = (torch.full((worlds, 3), 20.0), torch.full((worlds, 3), 0.5))
+    return Joints(NAMES, limits, torch.zeros(3), actions, DT, DECIMATION, pose, gains, "motors.own")
 
 
 def settings(model, **constants):
@@ -88,6 +89,7 @@ def described(motors, pose=POSE, names=NAMES, peak=PEAK):
     """What the twin reads of ``policy.yaml``."""
     description = {"joint_order": names, "nominal_pose": dict(zip(names, pose, strict=True)), "motors": motors}
     description["timing"] = {"decimation": DECIMATION, "physics_frequency": 1.0 / DT}
+    description["gains"] = {name: dict.fromkeys(names, 1.0) for name in ("stiffness", "damping")}
     return description | {"torque_limits": {name: [-peak, peak] for name in names}}
 
 

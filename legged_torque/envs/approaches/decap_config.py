@@ -12,6 +12,8 @@ class DecapCfg(TorqueCfg):
         class decap(Section):
             gamma: Fraction = 0.99  # factor on the bias every
             k: Positive = 409_600.0  # total steps: the authors' 100 control steps, in 4096 worlds
+            record: str = ""  # CSV file of the reference by joint [rad], from an episode's start; empty: nominal pose
+            row_time: Positive = 0.02  # [s] for which a row of it is the reference
 
     class rewards:
         imitation_temperature: Positive = 10.0  # of the term

@@ -12,6 +12,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.motors.config import by_joint
 from legged_torque.motors.kernel import control_law, launch_law, read
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import Mirroring
 
 
 class ControlParameters:
@@ -66,6 +67,7 @@ class ActionTerm:
     weight: Tensor | None = None  # of its torques, a scalar on the device; None is 1
     interval: int = 1  # control steps for which its actions are held, from the start of an episode on
     is_unsigned: bool = False  # whether actions keep their signs in a mirror image
+    whole_law: Any = None  # a law of all actions of a world, in place of the sum of the terms' laws
 
     def torques(self, actions: Tensor, pos: Tensor, vel: Tensor) -> Tensor:
         """Return the torques of this term without its weight [N m].
@@ -90,7 +92,14 @@ class ControlLaw:
         """Put terms together, each with one action per joint, in this order."""
         self.terms, self.num_actions = list(terms), len(terms) * num_dof
         laws = [((term.law, term.reads), term.weight) for term in terms]
-        self.kernel = control_law(laws, num_dof) if all(term.law for term in terms) else None
+        whole = [(term.whole_law, term.reads) for term in terms if term.whole_law]
+        if not whole and all(term.law for term in terms):
+            whole = [control_law(laws, num_dof)]
+        self.kernel = whole[0] if whole else None
+
+    def mirrors(self, joints: Mirroring | None) -> list[tuple[str, Mirroring | None]]:
+        """Return the mirror images of the actions by term, given that of joint angles; None where it is not known."""
+        return [(term.name, joints.unsigned() if joints and term.is_unsigned else joints) for term in self.terms]
 
     def torques(self, actions: Tensor, pos: Tensor, vel: Tensor, out: Tensor) -> Tensor:
         """Write the torques that motors are asked for to ``out`` [N m], and return it.
@@ -126,11 +135,17 @@ class PdControl:
 
 
 @wp.func
+def pd_target(pd: PdControl, action: float, world: int, joint: int) -> float:
+    """q_nominal + scale a [rad]."""
+    target = pd.default_dof_pos[joint] + pd.joint_offset[world, joint]
+    return target + of_joint(pd.action_scale, world, joint) * action
+
+
+@wp.func
 def pd_torque(pd: PdControl, action: float, world: int, joint: int, pos: float, vel: float) -> float:
     """tau = Kp (q_nominal + scale a - q) - Kd qd [N m] (eq. 8)."""
-    target = pd.default_dof_pos[joint] + pd.joint_offset[world, joint]
-    target += of_joint(pd.action_scale, world, joint) * action
-    return pd.p_gains[world, joint] * (target - pos) - pd.d_gains[world, joint] * vel
+    error = pd_target(pd, action, world, joint) - pos
+    return pd.p_gains[world, joint] * error - pd.d_gains[world, joint] * vel
 
 
 @wp.struct

@@ -136,7 +136,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the terms of all groups of observations."""
         drawn = (self.randomization.values, self.parameter_mirrors)
-        return standard_terms(self.cfg, self.state, self.control, *drawn, self.symmetry, self.sensors)
+        robot = (self.cfg, self.state, self.control, self.control_law)
+        return standard_terms(*robot, *drawn, self.symmetry, self.sensors)
 
     def random_parameters(self) -> list[RandomParameter]:
         """Return what ``domain_rand`` draws in each world."""
@@ -336,8 +337,9 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
         clock = (cfg.sim.dt, cfg.control.decimation)
-        constants = (self.dof_names, self.torque_limits, armature)
-        self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, self.default_dof_pos))
+        constants, control = (self.dof_names, self.torque_limits, armature), self.control
+        targets = (control.default_dof_pos, (control.p_gains, control.d_gains))
+        self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, *targets))
         self.motor_strength = self.motors.strength
         self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
         self._torque_kernel = None
@@ -389,9 +391,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """
         unknown = [name for name, mirroring in self.parameter_mirrors.items() if mirroring is None]
         problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
-        joints, terms = self.symmetry.joints, self.control_law.terms
-        actions = [(term.name, joints.unsigned() if joints and term.is_unsigned else joints) for term in terms]
-        return Mirror(self.observations.mirrors() | {"actions": actions}, self.symmetry.problem or problem, self.device)
+        mirrors = self.observations.mirrors() | {"actions": self.control_law.mirrors(self.symmetry.joints)}
+        return Mirror(mirrors, self.symmetry.problem or problem, self.device)
 
     def _use_attributes_of(self, owner: RobotState | ControlParameters) -> None:
         """Have the tensors of an object as attributes, too."""

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.actions import ControlParameters
+from legged_torque.envs.base.actions import ControlLaw, ControlParameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.symmetry import RobotSymmetry
@@ -56,6 +56,7 @@ def standard_terms(
     cfg: LeggedRobotCfg,
     state: RobotState,
     control: ControlParameters,
+    law: ControlLaw,
     parameters: Tensor,
     parameter_mirrors: Mapping[str, Mirroring | None],
     symmetry: RobotSymmetry,
@@ -69,6 +70,7 @@ def standard_terms(
         cfg: Settings of the task.
         state: The robots.
         control: Their nominal pose.
+        law: What their actions are.
         parameters: The drawn parameters, see ``Randomization.values``. Shape: (num_envs, any).
         parameter_mirrors: Their mirror images, by name.
         symmetry: Which joints and feet are mirror images of each other.
@@ -78,7 +80,7 @@ def standard_terms(
     scan, sensing = sensors.height_scan, sensors.sensing
     command_scales = (scales.lin_vel, scales.lin_vel, scales.ang_vel)
     joints, feet = symmetry.joints, symmetry.feet
-    actions = joints and Mirroring.joined([joints] * (state.actions.shape[1] // state.dof_pos.shape[1]))
+    actions = joints and Mirroring.joined([mirror for _, mirror in law.mirrors(joints) if mirror])
     images = [mirror for mirror in parameter_mirrors.values() if mirror]
     parameter_mirror = Mirroring.joined(images) if len(images) == len(parameter_mirrors) else None
 
