@@ -1,5 +1,7 @@
 """Access to the page: only from this machine and from the page itself, or with the token in the printed address."""
 
+import asyncio
+import contextlib
 import functools
 import http
 import ipaddress
@@ -27,6 +29,19 @@ LOGGERS = ("asyncio", "websockets.server")  # quote what clients send wrong, whi
 VERSION = f"viser-v{viser.__version__}"  # of pages that may connect; viser prints all others
 
 
+class LoopEvent(asyncio.Event):
+    """Of a buffer of messages: other threads do not set it, since waiters then may miss it, and the page stands still.
+
+    viser sets it from the thread that writes a message, and then from the loop's, where a second time does nothing.
+    """
+
+    def set(self) -> None:
+        """Wake the waiters, from the thread of the event loop only."""
+        with contextlib.suppress(RuntimeError):  # there is no loop in this thread
+            asyncio.get_running_loop()
+            super().set()
+
+
 class GuardedServer(viser.ViserServer):
     """A viser server that accepts or refuses HTTP requests and WebSocket handshakes.
 
@@ -49,8 +64,11 @@ class GuardedServer(viser.ViserServer):
         for name in LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         warnings.filterwarnings("ignore", r"\[viser\]")  # as do the loggers
-        self._handle = self._websock_server._handle_incoming_message
-        self._websock_server._handle_incoming_message = self._receive
+        sockets = self._websock_server
+        sockets.get_message_buffer().message_event = LoopEvent()
+        sockets.on_client_connect(lambda client: setattr(client.get_message_buffer(), "message_event", LoopEvent()))
+        self._handle = sockets._handle_incoming_message
+        sockets._handle_incoming_message = self._receive
 
     @property
     def url(self) -> str:

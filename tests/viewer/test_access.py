@@ -1,8 +1,11 @@
-"""Who may use the page, asked by real connections to its server."""
+"""Who may use the page, asked by real connections to its server, and what reaches them."""
 
+import asyncio
 import contextlib
 import http.client
 import socket
+import sys
+import threading
 
 import pytest
 
@@ -145,3 +148,30 @@ def test_ports():
         free_port("192.0.2.1", 8480)
     with pytest.raises(UserError, match="cannot serve at no-such-host:8480"):
         free_port("no-such-host", 8480)
+
+
+@pytest.mark.parametrize("is_for_all", [True, False])
+def test_no_message_is_missed(is_for_all):
+    """What another thread writes at the very moment at which a connection begins to wait for messages arrives."""
+    server, expected = GuardedServer("127.0.0.1", 8440, "title"), []
+    loop = server._websock_server._background_event_loop
+    make = loop.create_future
+
+    def create_future():
+        """Write between a look at an event and the wait for it."""
+        if sys._getframe(1).f_code is asyncio.Event.wait.__code__ and len(expected) < 5:
+            expected.append(f"message {len(expected)}")
+            to = server if is_for_all else next(iter(server.get_clients().values()))
+            writer = threading.Thread(target=to.gui.add_html, args=(expected[-1],))
+            writer.start()
+            writer.join()
+        return make()
+
+    with visitor(server) as send:
+        loop.create_future = create_future
+        for to in (server, *server.get_clients().values()):
+            to.gui.add_html("first")
+        wait_for(lambda: len(expected) == 5)
+        while expected[-1].encode() not in send.receive(timeout=10.0):
+            pass
+    server.stop()

@@ -104,11 +104,9 @@ class Block(nn.Module):
     def __init__(self, size: int, copies: tuple[int, ...] = ()) -> None:
         """Create the layers, of which the first is :data:`EXPANSION` times as wide."""
         super().__init__()
-        self.first, self.first_norm = (
-            UnitLinear(size, EXPANSION * size, copies),
-            UnitBatchNorm(EXPANSION * size, copies),
-        )
-        self.second, self.second_norm = UnitLinear(EXPANSION * size, size, copies), UnitBatchNorm(size, copies)
+        inner = EXPANSION * size
+        self.first, self.first_norm = UnitLinear(size, inner, copies), UnitBatchNorm(inner, copies)
+        self.second, self.second_norm = UnitLinear(inner, size, copies), UnitBatchNorm(size, copies)
 
     def forward(self, x: Tensor, learning: bool) -> Tensor:
         """Return features of the same shape; ``learning`` as of :class:`UnitBatchNorm`."""
@@ -122,10 +120,8 @@ class Trunk(nn.Module):
     def __init__(self, num_inputs: int, hidden_dim: int, num_blocks: int, copies: tuple[int, ...] = ()) -> None:
         """Create the layers."""
         super().__init__()
-        self.input_norm, self.input_layer = (
-            UnitBatchNorm(num_inputs, copies),
-            UnitLinear(num_inputs, hidden_dim, copies),
-        )
+        self.input_norm = UnitBatchNorm(num_inputs, copies)
+        self.input_layer = UnitLinear(num_inputs, hidden_dim, copies)
         self.blocks = nn.ModuleList([Block(hidden_dim, copies) for _ in range(num_blocks)])
         self.norm = UnitRMSNorm(hidden_dim, copies)
 
