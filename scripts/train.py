@@ -29,7 +29,7 @@ from legged_torque.utils.devices import busy_cores_note, device_name, resolve_de
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
-from legged_torque.utils.runs import CONFIG_FILE, new_run_dir, package_versions
+from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint_of, load_config, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 from legged_torque.utils.words import counted
 from legged_torque.viewer.training_viewer import TrainingViewer
@@ -80,6 +80,8 @@ def main() -> None:
         options.task = options.task or DEFAULT_TASK
         with cli.slow_imports():
             env_cfg, train_cfg = new_settings(options)
+            if train_cfg.distillation.teachers:
+                env_cfg, train_cfg = settings_of_student(options, train_cfg)
         processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
     on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu"
     if on_cores and distributed.use_cores(processes) and options.resume:
@@ -104,6 +106,15 @@ def new_settings(options: Options) -> tuple[Any, Any]:
     if is_open and resolve_device(options.device) == "cpu":
         options.preset = CPU_PRESET
         return task_registry.get_cfgs(options.task, options)
+    return env_cfg, train_cfg
+
+
+def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
+    """Return settings as options change them, with the task of the first teacher's run, and teachers by their files."""
+    root, names = experiment_dir(train_cfg, options.log_root), train_cfg.distillation.teachers
+    files = [find_checkpoint_of(root, name).resolve() for name in names]
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, load_config(files[0].parent) | {"train": {}})
+    train_cfg.distillation.teachers = list(map(str, files))
     return env_cfg, train_cfg
 
 

@@ -26,7 +26,13 @@ from legged_torque.envs.approaches import (
     torque_gravity,
     variable_stiffness_config,
 )
-from legged_torque.envs.base import commands_config, flashsac_config, legged_robot_config, linear_change
+from legged_torque.envs.base import (
+    commands_config,
+    distillation_config,
+    flashsac_config,
+    legged_robot_config,
+    linear_change,
+)
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.state import RobotState
@@ -40,7 +46,8 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder", "Network")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
-SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors.", "FlashSACCfg": "flashsac."}
+SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
+SECTIONS |= {"FlashSACCfg": "flashsac.", "DistillationCfg": "distillation."}
 """Where the settings of some classes stand."""
 CONFIGS = (
     (linear_change, "LinearChange"),
@@ -49,6 +56,7 @@ CONFIGS = (
     *((model_config, f"{name}Cfg") for name in ("Motors", "Model", "Curve", *LINKS)),
     (legged_robot_config, "LeggedRobotCfgPPO"),
     (flashsac_config, "FlashSACCfg"),
+    (distillation_config, "DistillationCfg"),
     (a1, "A1Cfg"),
     (a1, "A1CfgPPO"),
     (anymal_c, "AnymalCCfg"),

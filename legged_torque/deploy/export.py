@@ -25,7 +25,15 @@ from legged_torque.deploy.description import (
     require,
     to_yaml,
 )
-from legged_torque.deploy.policy import OBSERVATIONS, Policy, State, load_network, parts_without_function
+from legged_torque.deploy.policy import (
+    OBSERVATIONS,
+    Policy,
+    State,
+    empty_memory,
+    load_network,
+    parts_without_function,
+    run_network,
+)
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.delay import ActionDelay
@@ -39,7 +47,7 @@ from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
 NUM_SUBSTEPS = 3  # physics steps in which motors that remember are compared
-NUM_SAMPLES = 256  # random observations on which the exported networks are compared
+NUM_SAMPLES = 256  # random observations on which the exported networks are compared, one after another with a memory
 INITIAL_STATE = {
     "trunk_place": "init_place",
     **{angle: f"init_{angle}" for angle in ("roll", "pitch", "yaw")},
@@ -80,7 +88,7 @@ def export_policy(
         Largest difference between the exported networks and the model, and what is unsupported.
 
     Raises:
-        UserError: If the network has memory or reads other observations or images, or a package is missing.
+        UserError: If the network reads other observations or images, or a package is missing.
     """
     require("onnx", "onnxruntime", "jsonschema")
     refuse(network_problems(task, model))
@@ -102,8 +110,6 @@ def export_policy(
 
 def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
     """Return why a network cannot be exported at all."""
-    if getattr(model, "is_recurrent", True):  # which rsl_rl's models say
-        return ["only policies without memory can be exported"]
     if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel
         return [f"policies that see images cannot be exported: {', '.join(model.obs_groups_2d)}"]
     further = task.observations.groups
@@ -142,17 +148,22 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
     """
     import onnx
 
-    network = model.as_onnx(verbose=False).cpu().eval()
+    network, memory = model.as_onnx(verbose=False).cpu().eval(), description["network"].get("memory", [])
+    inputs, outputs = (["obs"] + [each["input"] for each in memory], ["actions"] + [each["output"] for each in memory])
+    kept = [torch.zeros(each["layers"], 2, each["size"]) for each in memory]
+    axes = {name: {int(name not in ("obs", "actions")): "batch"} for name in inputs + outputs}
     with warnings.catch_warnings():
         # The older exporter needs 0.3 s instead of 6, writes the same nodes, and keeps everything in one file.
         warnings.simplefilter("ignore", DeprecationWarning)
+        warnings.filterwarnings("ignore", "Exporting a model to ONNX with a batch_size")  # its memory is an input
+        warnings.simplefilter("ignore", torch.jit.TracerWarning)  # torch checks the sizes of that
         torch.onnx.export(
             network,
-            (torch.zeros(2, model.obs_dim),),
+            (torch.zeros(2, model.obs_dim), *kept),
             str(folder / NETWORK_FILE),
-            input_names=["obs"],
-            output_names=["actions"],
-            dynamic_axes={"obs": {0: "batch"}, "actions": {0: "batch"}},
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes=axes,
             opset_version=17,
             dynamo=False,
         )
@@ -164,11 +175,14 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
     description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
     check(description)
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
+    steps = obs.split(1 if memory else NUM_SAMPLES)
+    original, loaded = model.as_jit().cpu().eval(), torch.jit.load(str(folder / TORCHSCRIPT_FILE))
+    session, remembered, difference = load_network(folder / NETWORK_FILE, description), empty_memory(description), 0.0
     with torch.inference_mode():
-        expected = model.as_jit().cpu().eval()(obs).numpy()
-        loaded = torch.jit.load(str(folder / TORCHSCRIPT_FILE))(obs).numpy()
-    (run,) = load_network(folder / NETWORK_FILE, description).run(["actions"], {"obs": obs.numpy()})
-    difference = max(_difference(run, expected), _difference(loaded, expected))
+        for step in steps:
+            expected = original(step).numpy()
+            others = (run_network(session, step.numpy(), remembered), loaded(step).numpy())
+            difference = max(difference, *(_difference(other, expected) for other in others))
     if not difference <= TOLERANCE:
         raise UserError(f"the exported network differs from the checkpoint's by {difference:.3g}; nothing was written")
     return difference
@@ -185,6 +199,7 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         own, keys = mj_model.joint(joint), ("damping", "armature", "frictionloss")
         passive = {key: float(getattr(own, key)[0]) for key in keys}
         joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
+        joints[joint] |= {"range": own.range.tolist(), "max_velocity": float(asset.max_dof_vel)}
     observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
     description: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
@@ -195,7 +210,8 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         "versions": package_versions() | {"legged_torque": __version__},
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
-        | {"num_observations": model.obs_dim, "num_actions": task.num_actions},
+        | {"num_observations": model.obs_dim, "num_actions": task.num_actions}
+        | _memory(model),
         "joint_order": list(task.dof_names),
         "nominal_pose": _by_joint(task, task.default_dof_pos),
         "nominal_trunk_height": cfg.rewards.base_height_target,
@@ -231,6 +247,20 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
     if cfg.terrain.mesh_type == "heightfield":
         description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
     return description
+
+
+def _memory(model: MLPModel) -> dict[str, Any]:
+    """Return the entry ``memory`` of a network, by the names of rsl_rl's export; nothing if it remembers nothing."""
+    if not model.is_recurrent:
+        return {}
+    network: Any = model.as_onnx(verbose=False)
+    ends = zip(network.input_names[1:], network.output_names[1:], network.get_dummy_inputs()[1:], strict=True)
+    return {
+        "memory": [
+            {"input": given, "output": returned, "layers": len(state), "size": state.shape[2]}
+            for given, returned, state in ends
+        ]
+    }
 
 
 def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:

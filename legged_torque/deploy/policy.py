@@ -88,10 +88,11 @@ class Policy:
         self.reset()
 
     def reset(self) -> None:
-        """Start a new episode: forget the last action and the history."""
+        """Start a new episode: forget the last action, the history, and what the network remembers."""
         self._steps = 0
         self.last_action = np.zeros(self.description["network"]["num_actions"], np.float32)
         self._history: np.ndarray | None = None
+        self._memory = empty_memory(self.description)
 
     def observation(self, state: State, command: np.ndarray) -> np.ndarray:
         """Return the network's observations: the newest step, those before, then terms with groups of their own.
@@ -119,7 +120,7 @@ class Policy:
 
         Call it once per control step. A UserError if they are not finite. Shape: (actions,).
         """
-        (actions,) = self.session.run(["actions"], {"obs": np.asarray(obs, np.float32)[np.newaxis]})
+        actions = run_network(self.session, np.asarray(obs, np.float32)[np.newaxis], self._memory)
         if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
         new = np.clip(actions[0], *self._action_clip)
@@ -219,6 +220,24 @@ def parts_without_function(description: dict[str, Any]) -> list[str]:
     return terms + [f"no numpy function for the motor '{name}'" for name in motors]
 
 
+def empty_memory(description: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return what a network remembers at the start of an episode, by its inputs. Shapes: (layers, 1, size)."""
+    memory = description["network"].get("memory", [])
+    return {each["input"]: np.zeros((each["layers"], 1, each["size"]), np.float32) for each in memory}
+
+
+def run_network(session: Any, obs: np.ndarray, memory: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the actions of a network for rows of observations, and let its memory follow. Shape: (rows, actions)."""
+    actions, *remembered = session.run(None, {"obs": obs, **memory})
+    memory.update(zip(memory, remembered, strict=True))
+    return actions
+
+
+def _sizes(memory: dict[str, Any]) -> list[int]:
+    """Return layers and size of what a network remembers."""
+    return [memory["layers"], memory["size"]]
+
+
 def load_network(file: Path, description: dict[str, Any]) -> Any:
     """Return an onnxruntime session on one thread; a UserError if the file is not the network of a description."""
     require("onnxruntime")
@@ -232,8 +251,10 @@ def load_network(file: Path, description: dict[str, Any]) -> Any:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has an exception class per kind of damage
         raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
-    ends = [(node.name, node.shape[1:]) for node in (*session.get_inputs(), *session.get_outputs())]
-    expected = [("obs", [network["num_observations"]]), ("actions", [network["num_actions"]])]
+    nodes, memory = (*session.get_inputs(), *session.get_outputs()), network.get("memory", [])
+    ends = [(node.name, [size for size in node.shape if isinstance(size, int)]) for node in nodes]  # but for the robots
+    expected = [("obs", [network["num_observations"]]), *((each["input"], _sizes(each)) for each in memory)]
+    expected += [("actions", [network["num_actions"]]), *((each["output"], _sizes(each)) for each in memory)]
     if ends != expected:
         raise UserError(f"'{file}' has the input and output {ends}, not {expected}")
     if hashlib.sha256(content).hexdigest() != network["sha256"]:

@@ -10,7 +10,9 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
+from legged_torque.learning.memory import acting
 from legged_torque.learning.protocols import Evaluation
 from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
@@ -102,6 +104,7 @@ class TrainingEvaluator:
         if self._evaluation is None:
             return {}
         state = {"worlds": self._evaluation.task.world_state_dict(), "random_state": self._random_state}
+        state["memory"] = getattr(self._acting, "memory", None)
         return {tagged("evaluation", self.name): state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -109,6 +112,8 @@ class TrainingEvaluator:
         mine = state.get(tagged("evaluation", self.name))
         if mine:
             self._build().task.load_world_state_dict(mine["worlds"])
+            if mine["memory"] is not None:
+                self._acting.memory = tree_map(lambda value: value.to(self._task.device), mine["memory"])
             self._random_state.update(mine["random_state"])
             self._warm_up_runs = 0
 
@@ -121,6 +126,7 @@ class TrainingEvaluator:
                 worlds = self._evaluation.task
                 high = int(worlds.max_episode_length)
                 worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, high)
+            self._acting = acting(self._policy, lambda: worlds)
         return self._evaluation
 
     def _run(self, num_steps: int) -> None:
@@ -129,7 +135,7 @@ class TrainingEvaluator:
         with torch.no_grad():
             obs = evaluation.task.get_observations()
             for _ in range(num_steps):
-                obs = evaluation.step(self._policy(obs))
+                obs = evaluation.step(self._acting(obs))
 
 
 def make_evaluators(

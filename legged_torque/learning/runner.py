@@ -7,6 +7,7 @@ from rsl_rl import runners
 from torch import nn
 
 import legged_torque
+from legged_torque.learning.memory import acting
 from legged_torque.learning.trainer import Trainer
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
@@ -48,8 +49,8 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
             self.alg.allocate()
 
     def get_inference_policy(self, device: str | None = None) -> nn.Module:
-        """Return the policy for inference, on a device if one is given."""
-        return self.alg.policy().eval().to(device)
+        """Return the policy for inference in the worlds of ``env``, on a device if one is given."""
+        return acting(self.alg.policy().eval().to(device), lambda: self.env)
 
     def _configure_multi_gpu(self) -> None:
         """Join the processes that torchrun has started; rsl_rl's own method knows only GPUs."""

@@ -76,6 +76,10 @@ Sizes = Annotated[list[int], Limits(lowest=1, highest=1e6, nonempty=True)]
 Interval = Annotated[list[float], Limits(ordered=True)]
 Draw = dict[Literal["set", "add", "scale", "scale_per_joint"], Interval]
 Ranges = Annotated[Draw, DrawLimits()]
+Activation = Literal[
+    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
+]
+"""Activation functions that rsl_rl's networks know."""
 
 
 def check_value(name: str, value: Any, hint: Any) -> Any:

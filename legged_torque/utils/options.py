@@ -38,7 +38,7 @@ class Options:
     seed: Number | None = _option("random seed; default: that of the training settings")
     preset: str | None = _option(
         "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long), "
-        "paper (Table II) or flashsac (another learner)"
+        "paper (Table II), flashsac (another learner) or student (imitates distillation.teachers)"
     )
     perturbation: str | None = _option(
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "

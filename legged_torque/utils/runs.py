@@ -109,6 +109,15 @@ def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
     return checkpoint_file(run_dir, checkpoint)
 
 
+def find_checkpoint_of(root: Path, name: str) -> Path:
+    """Return the checkpoint that a name means: a file, or the last one of a run as of :func:`find_run`; a UserError."""
+    if not name.endswith(".pt"):
+        return find_checkpoint(find_run(root, name), None)
+    if not is_whole_archive(Path(name)) or not Path(name).stem.removeprefix(_CHECKPOINT).isdecimal():
+        raise UserError(f"'{name}' is no whole checkpoint, such as {_CHECKPOINT}50.pt in the folder of a run")
+    return Path(name)
+
+
 def newest_checkpoint(run_dir: Path) -> Path | None:
     """Return the file of a run's last checkpoint that is not damaged, or None."""
     files = (checkpoint_file(run_dir, number) for number in reversed(checkpoint_numbers(run_dir)))

@@ -234,7 +234,7 @@ def test_observations_of_a_user(make_task, tmp_path, monkeypatch):
     assert_told_in_one_line(run_here("sim2sim.py", str(out), root=tmp_path), "plain MuJoCo has no values of felt, feet")
     note = export_note(task, model)
     assert "felt" in note and "feet" in note and "\n" not in note
-    assert "memory" in export_note(task, SimpleNamespace(is_recurrent=True))
+    assert "camera" in export_note(task, SimpleNamespace(obs_groups_2d=["camera"]))
     assert not export_note(*export_random(make_task, "a1_torque", tmp_path / "plain"))
 
 
@@ -281,11 +281,10 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
     [
         ({"obs_groups": ["critic"]}, "must be 'policy', then groups of single terms (here none), not critic"),
         ({"obs_groups_2d": ["camera", "depth"]}, "policies that see images cannot be exported: camera, depth"),
-        ({"is_recurrent": True}, "only policies without memory can be exported"),
     ],
 )
 def test_networks_that_are_not_exported(make_task, tmp_path, change, message):
-    """Networks with memory, and what a robot cannot feed them, are refused by name before anything is written."""
+    """What a robot cannot feed a network is refused by name before anything is written."""
     model = SimpleNamespace(**{"is_recurrent": False, "obs_groups": ["policy"], **change})
     line = error_of(export_policy, make_task("a1_position", 3), model, tmp_path / "out", "a1_position", TRAINING)
     assert message in line and not list(tmp_path.iterdir())

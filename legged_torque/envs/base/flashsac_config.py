@@ -1,16 +1,11 @@
 """Settings of FlashSAC, with the names of rsl_rl_flashsac and the published values for 1024 worlds."""
 
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from legged_torque.utils.config import Section
-from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Count, Fraction, Limits, Positive
 
-PPO, FLASHSAC = "legged_torque.learning.ppo:OnDevicePPO", "legged_torque.learning.flashsac:FlashSAC"
-UNREAD = {PPO: ("flashsac.",), FLASHSAC: ("algorithm.", "actor.", "critic.")}
-"""Beginnings of the paths of settings that a learner does not read, but for :data:`SHARED`."""
-SHARED = ("algorithm.class_name", "algorithm.gamma", "algorithm.symmetry_cfg.")
+FLASHSAC = "legged_torque.learning.flashsac:FlashSAC"
 
 
 class FlashSACCfg(Section):
@@ -49,11 +44,3 @@ def preset() -> dict[str, dict[str, Any]]:
     runner = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
     worlds = {"num_envs": 1024, "num_envs_cpu": 1024}
     return {"env": worlds, "runner": runner, "algorithm": {"class_name": FLASHSAC, "gamma": 0.99}}
-
-
-def refuse_unread(learner: str, paths: Iterable[str]) -> None:
-    """Refuse, by UserError, changes at ``paths`` that a learner of ours does not read; a user's may read everything."""
-    for path in paths:
-        if path.startswith(UNREAD.get(learner, ())) and not path.startswith(SHARED):
-            reads = f"flashsac and {', '.join(SHARED)}" if learner == FLASHSAC else "algorithm, actor and critic"
-            raise UserError(f"{path} is not read by {learner}, which reads {reads}")

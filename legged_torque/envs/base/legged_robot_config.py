@@ -7,15 +7,17 @@ from typing import Annotated, Any, Literal
 
 from legged_torque.envs.base.clocks import set_clocks
 from legged_torque.envs.base.commands_config import CommandsCfg
+from legged_torque.envs.base.distillation_config import DistillationCfg
 from legged_torque.envs.base.flashsac_config import FlashSACCfg
 from legged_torque.envs.base.linear_change import LinearChange
 from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.base.presets import standard_presets
-from legged_torque.envs.base.training_config import Activation, TrainingCfg
+from legged_torque.envs.base.training_config import TrainingCfg
 from legged_torque.motors.config import DelayCfg, LatencyCfg, PerturbationCfg
 from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.utils.config import BaseConfig, to_dict
 from legged_torque.utils.limits import (
+    Activation,
     Count,
     Fraction,
     Interval,
@@ -381,6 +383,9 @@ class LeggedRobotCfgPPO(TrainingCfg):
             data_augmentation_func: str = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them
 
     class flashsac(FlashSACCfg):  # FlashSAC, the learner of the preset of that name
+        pass
+
+    class distillation(DistillationCfg):  # a student of other policies, the learner of the preset ``student``
         pass
 
     def presets(self) -> dict[str, dict]:

@@ -2,14 +2,14 @@
 
 from typing import Any
 
-from legged_torque.envs.base import flashsac_config
+from legged_torque.envs.base import distillation_config, flashsac_config
 
 
 def standard_presets() -> dict[str, dict[str, Any]]:
     """Return the changes to the settings of task and training by the presets' names, see ``TrainingCfg.presets``."""
     thorough = {"runner": {"total_steps": 330_000_000}}
     named = {"parallel": {}, "laptop": laptop(), "thorough": thorough, "paper": paper()}
-    return {**named, "flashsac": flashsac_config.preset()}
+    return {**named, "flashsac": flashsac_config.preset(), "student": distillation_config.preset()}
 
 
 def laptop() -> dict[str, Any]:

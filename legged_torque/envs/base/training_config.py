@@ -8,9 +8,10 @@ import io
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
-from legged_torque.envs.base.flashsac_config import refuse_unread
+from legged_torque.envs.base.distillation_config import DISTILLATION
+from legged_torque.envs.base.flashsac_config import FLASHSAC
 from legged_torque.envs.base.linear_change import scale_changes
 from legged_torque.utils.config import BaseConfig, flat, section_keys, to_dict, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
@@ -21,10 +22,14 @@ if TYPE_CHECKING:
 
 CODE_NAMES = ("class_name", "function", "_func")
 """Ends of the names of settings that name a class or a function, ``"module:Class"`` or a name in rsl_rl."""
-Activation: TypeAlias = Literal[
-    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
-]
-"""Activation functions that rsl_rl's networks know."""
+PPO = "legged_torque.learning.ppo:OnDevicePPO"
+SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.")  # of learners
+READ = {
+    PPO: ("algorithm.", "actor.", "critic."),
+    FLASHSAC: ("flashsac.", "algorithm.class_name", "algorithm.gamma", "algorithm.symmetry_cfg."),
+    DISTILLATION: ("distillation.", "algorithm.class_name"),
+}
+"""Beginnings of the paths of those settings that a learner reads; a user's own may read all."""
 
 
 class TrainingCfg(BaseConfig):
@@ -73,7 +78,12 @@ class TrainingCfg(BaseConfig):
     def refuse_unread(self, paths: Iterable[str]) -> None:
         """Raise a UserError if changed settings, by their dotted ``paths``, are not read by the chosen learner."""
         cfg: Any = self
-        refuse_unread(cfg.algorithm.class_name, paths)
+        learner = cfg.algorithm.class_name
+        read = READ.get(learner, SECTIONS)
+        for path in paths:
+            if path.startswith(SECTIONS) and not path.startswith(read):
+                allowed = ", ".join(name.rstrip(".") for name in read)
+                raise UserError(f"{path} is not read by {learner}, which reads {allowed}")
 
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.

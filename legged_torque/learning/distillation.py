@@ -1,0 +1,240 @@
+"""Students: policies that imitate others, which may see more (DAgger, arXiv 1011.0686)."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from rsl_rl import algorithms
+from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.utils._pytree import tree_map
+
+from legged_torque.envs import task_registry
+from legged_torque.learning.memory import RememberingPolicy
+from legged_torque.learning.protocols import Transition
+from legged_torque.terrain.rough import RoughGround
+from legged_torque.utils.config import flat, to_dict
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import Options
+from legged_torque.utils.runs import checkpoint_number, find_checkpoint_of
+
+SAME = ("asset.file", "control.", "init_state.", "normalization.", "sim.dt")
+"""Beginnings of the paths of settings in which a teacher's run must agree: they say what actions and numbers mean."""
+DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
+
+
+class Distillation(algorithms.Distillation):
+    """rsl_rl's Distillation as a learner: the student acts, and learns what its teachers would have done.
+
+    Attributes:
+        student: The policy.
+        teacher: The :class:`Teachers`, once :meth:`allocate` has loaded them.
+    """
+
+    capturable = False
+    needs_next_obs = False
+
+    def __init__(self, student: MLPModel, env: Any, cfg: dict[str, Any], device: str) -> None:
+        """Create the learner of a student in a task, from settings in rsl_rl's layout."""
+        settings, num_steps, obs = cfg["distillation"], cfg["num_steps_per_env"], env.get_observations()
+        names = ("learning_rate", "num_learning_epochs", "gradient_length", "max_grad_norm", "loss_type")
+        per_update = settings["num_learning_epochs"] * num_steps
+        if per_update % settings["gradient_length"]:
+            raise UserError(
+                f"distillation.gradient_length must divide the {per_update} steps of an update (num_learning_epochs x "
+                f"runner.num_steps_per_env), not be {settings['gradient_length']}"
+            )
+        seen = obs.select(*student.obs_groups)
+        storage = RolloutStorage("distillation", env.num_envs, num_steps, seen, [env.num_actions], device)
+        chosen = {name: settings[name] for name in names}
+        super().__init__(student, Teachers([], env), storage, device=device, multi_gpu_cfg=cfg["multi_gpu"], **chosen)
+        self._env, self._task_name, self._files = env, cfg.get("task"), settings["teachers"]
+
+    @classmethod
+    def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> "Distillation":
+        """Build the learner from settings in rsl_rl's layout; teachers are loaded when training needs them."""
+        if cfg["pretraining"]["function"]:
+            raise UserError("a student does not start from pretraining.function: it learns from its teachers")
+        settings = dict(cfg["distillation"]["student"])
+        distribution = {"class_name": DISTRIBUTION, "init_std": settings.pop("init_std"), "std_type": "scalar"}
+        network = RNNModel
+        if settings["rnn_type"] == "none":
+            settings = {name: settings[name] for name in ("hidden_dims", "activation")}
+            network = MLPModel
+        student = network(obs, cfg["obs_groups"], "actor", env.num_actions, distribution_cfg=distribution, **settings)
+        return cls(student.to(device), env, cfg, device)
+
+    # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
+
+    def allocate(self) -> None:
+        """Load the teachers; a UserError if there are none, or one does not fit the task."""
+        if not self._files:
+            raise UserError("a student needs teachers: --set distillation.teachers=RUN names the run of a trained one")
+        members = [Teacher(file, self._env, self._task_name) for file in self._files]
+        self.teacher = Teachers(members, self._env)
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Return the student's actions with noise, and keep its teachers'. Shape: (num_envs, num_actions)."""
+        if not self.teacher.members:
+            self.allocate()  # of a training that keeps no run
+        seen = obs.select(*self.student.obs_groups)
+        self.transition.observations, self.transition.privileged_actions = seen, self.teacher(obs)
+        self.transition.actions = self.student(seen, stochastic_output=True).detach()
+        return self.transition.actions
+
+    def observe(self, transition: Transition) -> None:
+        """Keep a step, and forget the worlds whose episodes have ended."""
+        self.process_env_step(transition.obs_after, transition.rewards, transition.dones, transition.extras)
+
+    def due(self) -> bool:
+        """Return that an update is due: the storage holds one rollout."""
+        return True
+
+    def policy(self) -> MLPModel:
+        """Return the student."""
+        return self.student
+
+    def update(self) -> dict[str, float]:
+        """Learn from the rollout, and return the loss "behavior", the learning rate and the noise."""
+        std = float(self.student.output_std.detach().mean())
+        return super().update() | {"learning_rate": self.learning_rate, "action_std": std}
+
+    def broadcast_parameters(self) -> None:
+        """Give all processes the student of the first one; teachers are the same files."""
+        for tensor in self.student.state_dict().values():
+            torch.distributed.broadcast(tensor, src=0)
+
+    # ---- state -------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return student and optimizer, each tensor in memory of its own."""
+        parts = {"actor_state_dict": self.student.state_dict(), "optimizer_state_dict": self.optimizer.state_dict()}
+        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, parts)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Load all parts of a :meth:`state_dict`."""
+        self.load(state, None, True)
+
+    def load(self, state: dict[str, Any], load_cfg: dict | None, strict: bool) -> bool:
+        """Load parts of a :meth:`state_dict`, and return whether to go on from its iteration.
+
+        ``load_cfg`` may choose "actor" and "iteration"; None loads everything.
+        """
+        if load_cfg is None or load_cfg.get("actor"):
+            self.student.load_state_dict(state["actor_state_dict"], strict)
+        if load_cfg is None:
+            self.optimizer.load_state_dict(state["optimizer_state_dict"])
+        return load_cfg is None or load_cfg.get("iteration", False)
+
+    def world_state_dict(self) -> dict[str, Any]:
+        """Return what student and teachers remember of the worlds; nothing before the first update."""
+        memory = self.student.get_hidden_state()
+        teachers = [policy.memory for policy in self.teacher.recurrent()]
+        return {"student": memory, "teachers": teachers} if self.num_updates else {}
+
+    def load_world_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a :meth:`world_state_dict`."""
+        if state:
+            state = tree_map(lambda value: value.to(self.device) if isinstance(value, Tensor) else value, state)
+            self.student.reset(hidden_state=state["student"])
+            self.last_hidden_states = (state["student"], None)
+            for policy, memory in zip(self.teacher.recurrent(), state["teachers"], strict=True):
+                policy.memory = memory
+
+
+class Teacher:
+    """A policy in a student's task, with the observations that it knows.
+
+    Its own runner is built with this in place of the task: what the runner sets stays here, the rest is the task's.
+
+    Attributes:
+        cfg: Settings of the task of its run.
+        policy: From its observations to mean actions.
+    """
+
+    policy: Any
+
+    def __init__(self, name: str, env: Any, task: str | None) -> None:
+        """Load the policy of a run or checkpoint for a task.
+
+        The counters of the task become those of the teacher's training: they say how far curricula are. A UserError if
+        the run is of another task, or its actions or observations have another meaning.
+        """
+        file = find_checkpoint_of(Path(name).parent, name)
+        number = checkpoint_number(file)
+        options = Options(task=task or "", device=env.device, load_run=str(file.parent), checkpoint=number)
+        run = task_registry.load_run(options)
+        own, theirs = flat(to_dict(env.cfg)), flat(to_dict(run.env_cfg))
+        for path in sorted(own.keys() | theirs.keys()):
+            if path.startswith(SAME) and own.get(path) != theirs.get(path):
+                raise UserError(f"the teacher '{name}' has {path}={theirs.get(path)}, its student {own.get(path)}")
+        self._env, self.cfg = env, run.env_cfg
+        self._size = env.observations.policy_size * run.env_cfg.env.history_length
+        runner = run.train_cfg.make_runner(self, run.task, None)
+        runner.load(str(run.checkpoint), {"actor": True, "iteration": False})
+        self.policy = runner.get_inference_policy(env.device)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what is the task's; its graph of steps is not for the teacher's runner."""
+        if name in ("_env", "step_graph"):
+            raise AttributeError(name)
+        return getattr(self._env, name)
+
+    def __call__(self, obs: TensorDict) -> Tensor:
+        """Return mean actions. Shape: (num_envs, num_actions)."""
+        return self.policy(self.seen(obs))
+
+    def get_observations(self) -> TensorDict:
+        """Return the task's observations as the policy sees them."""
+        return self.seen(self._env.get_observations())
+
+    def seen(self, obs: TensorDict) -> TensorDict:
+        """Return observations whose history is as long as in the teacher's training."""
+        newest = obs["policy"][:, : self._size]
+        return TensorDict({**obs, "policy": newest}, obs.batch_size)
+
+
+class Teachers(nn.Module):
+    """Teachers of one student, each in the worlds on whose kind of ground it has trained.
+
+    Attributes:
+        members: The teachers.
+    """
+
+    def __init__(self, members: list[Teacher], env: Any) -> None:
+        """Share out the worlds of a task; where several or none have trained on a kind of ground, they take turns."""
+        super().__init__()
+        self.members = members
+        self._chosen = torch.tensor(shared_out([member.cfg for member in members], env), device=env.device)
+
+    def forward(self, obs: TensorDict) -> Tensor:
+        """Return the actions of each world's teacher. Shape: (num_envs, num_actions)."""
+        with torch.no_grad():
+            result, *others = (member(obs) for member in self.members)
+        for number, actions in enumerate(others, 1):
+            result = torch.where((self._chosen == number).unsqueeze(1), actions, result)
+        return result
+
+    def reset(self, dones: Tensor | None = None, hidden_state: Any = None) -> None:
+        """Do nothing: recurrent teachers know their worlds, see :class:`RememberingPolicy`."""
+
+    def get_hidden_state(self) -> None:
+        """Return nothing, for the same reason."""
+
+    def recurrent(self) -> list[RememberingPolicy]:
+        """Return the policies that have a memory."""
+        return [member.policy for member in self.members if isinstance(member.policy, RememberingPolicy)]
+
+
+def shared_out(cfgs: list[Any], env: Any) -> list[int]:
+    """Return the number of each world's teacher, from the settings of the teachers' tasks."""
+    everyone, ground = list(range(len(cfgs))), env.terrain
+    if len(cfgs) < 2 or not isinstance(ground, RoughGround):
+        return [world % max(len(cfgs), 1) for world in range(env.num_envs)]
+    shares = [to_dict(cfg.terrain.terrain_proportions) for cfg in cfgs]
+    kinds = ground.layout.kinds()
+    able = {kind: [i for i in everyone if shares[i].get(kind)] or everyone for kind in kinds}
+    of_worlds = (able[kinds[column]] for column in ground.columns.tolist())
+    return [teachers[world % len(teachers)] for world, teachers in enumerate(of_worlds)]

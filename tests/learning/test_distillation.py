@@ -1,0 +1,201 @@
+"""Students: gradients through time, memory and episodes, teachers and their worlds, resumed bits, refusals."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from support.reproducible import differences, values
+from support.scripts import assert_told_in_one_line, run_here
+from tensordict import TensorDict
+from torch import nn
+
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.distillation_config import DistillationCfg
+from legged_torque.learning import checkpoint
+from legged_torque.learning.distillation import Distillation, Teachers, shared_out
+from legged_torque.learning.memory import acting
+from legged_torque.learning.protocols import Transition
+from legged_torque.utils.config import section_keys, to_dict
+
+WORLDS, STEPS, OBS, ACTIONS = 3, 8, 5, 2
+SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_steps_per_env=4"]
+SMALL += ["--set=evaluation.interval=16", "--set=evaluation.num_samples=20"]
+OF_TEACHER = ["--task=a1_position", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
+OF_TEACHER += ["--set=algorithm.num_mini_batches=2", "--max_iterations=1", "--perturbation=low"]
+OF_STUDENT = ["--task=a1_position", "--preset=student", "--set=distillation.gradient_length=4"]
+MAP = {"terrain.num_rows": 1, "terrain.num_cols": 4, "terrain.max_init_terrain_level": 0}
+OF_STUDENT += ["--set=distillation.student.rnn_hidden_dim=8", "--set=distillation.student.hidden_dims=[8]"]
+
+
+class Wise(nn.Module):
+    """In place of teachers: a function of what the student does not see."""
+
+    members = ["one"]
+
+    def forward(self, obs):
+        return obs["more"]
+
+    def reset(self, dones=None, hidden_state=None):
+        pass
+
+    def get_hidden_state(self):
+        pass
+
+
+def observations():
+    """Random ones, of which the student sees the first group."""
+    return TensorDict({"policy": torch.randn(WORLDS, OBS), "more": torch.randn(WORLDS, ACTIONS)}, [WORLDS])
+
+
+def make_learner(**settings):
+    """A learner in a task of which only the observations are known."""
+    cfg = to_dict(DistillationCfg()) | {"num_learning_epochs": 1, "gradient_length": STEPS, **settings}
+    cfg["student"] |= {"rnn_hidden_dim": 4, "hidden_dims": [3], "rnn_type": settings.pop("rnn_type", "gru")}
+    train_cfg = {"distillation": cfg, "num_steps_per_env": STEPS, "obs_groups": {"actor": ["policy"]}}
+    train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None}
+    env = SimpleNamespace(num_envs=WORLDS, num_actions=ACTIONS, device="cpu", get_observations=observations)
+    env.terrain = None
+    alg = Distillation.construct_algorithm(observations(), env, train_cfg, "cpu")
+    alg.teacher = Wise()
+    return alg
+
+
+def roll_out(alg):
+    """One rollout with ends of episodes; its observations and ends."""
+    seen, ends = [], []
+    for _ in range(STEPS):
+        obs, dones = observations(), torch.rand(WORLDS) < 0.3
+        alg.act(obs)
+        alg.observe(Transition(obs, None, torch.zeros(WORLDS), dones, None, obs, None, {}))
+        seen.append(obs)
+        ends.append(dones)
+    return seen, ends
+
+
+def by_hand(student, seen, ends, hidden):
+    """The loss of a rollout with torch's GRU cell, whose state is 0 after the end of an episode."""
+    cell = nn.GRUCell(OBS, 4)
+    of_layer = {name.removesuffix("_l0"): value for name, value in student.rnn.rnn.named_parameters()}
+    loss = 0.0
+    for obs, dones in zip(seen, ends, strict=True):
+        hidden = torch.func.functional_call(cell, of_layer, (obs["policy"], hidden))
+        loss = loss + (student.mlp(hidden) - obs["more"]).square().mean()
+        hidden = hidden * ~dones.unsqueeze(1)
+    return loss, hidden
+
+
+def test_gradients_go_back_in_time():
+    """An update's gradients are those of the loss of the rollout, but not through ends of episodes and rollouts."""
+    torch.manual_seed(0)
+    alg, hidden = make_learner(max_grad_norm=1e9), torch.zeros(WORLDS, 4)
+    for _ in range(3):
+        seen, ends = roll_out(alg)
+        assert any(dones.any() for dones in ends)
+        loss, hidden = by_hand(alg.student, seen, ends, hidden.detach())
+        learned = [value for name, value in alg.student.named_parameters() if not name.startswith("distribution")]
+        expected = torch.autograd.grad(loss, learned)
+        numbers = alg.update()
+        assert numbers["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
+        for parameter, gradient in zip(learned, expected, strict=True):
+            torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("rnn_type", ["gru", "lstm"])
+def test_a_policy_remembers_its_own_worlds(rnn_type):
+    """Elsewhere, too, a network starts each episode with nothing, and forgets nothing of the worlds of its learner."""
+    torch.manual_seed(0)
+    alg, worlds = make_learner(rnn_type=rnn_type), SimpleNamespace(reset_buf=torch.ones(2, dtype=torch.bool))
+    roll_out(alg)
+    network, policy = alg.policy(), acting(alg.policy(), lambda: worlds)
+    before = torch.utils._pytree.tree_map(torch.clone, network.get_hidden_state())
+    given = torch.randn(6, 2, OBS)
+    starts = torch.tensor([[True, True], [False, False], [False, True], [False, False], [True, False], [False, False]])
+    with torch.no_grad():
+        got = []
+        for obs, worlds.reset_buf in zip(given, starts, strict=True):
+            got.append(policy({"policy": obs}))
+        torch.testing.assert_close(network.get_hidden_state(), before)
+        for world, episodes in enumerate([[(0, 4), (4, 6)], [(0, 2), (2, 6)]]):
+            for start, end in episodes:
+                alone = network.mlp(network.rnn.rnn(given[start:end, world])[0])
+                torch.testing.assert_close(torch.stack(got)[start:end, world], alone)
+    assert acting(make_learner(rnn_type="none").policy(), None).is_recurrent is False
+
+
+def test_teachers_teach_where_they_have_trained(make_task):
+    """Worlds on a kind of ground have its teacher; those on a kind of several, or of none, take turns."""
+
+    def cfg(*kinds):
+        env_cfg, _ = task_registry.get_cfgs("a1_rough_torque")
+        for name in section_keys(env_cfg.terrain.terrain_proportions):
+            setattr(env_cfg.terrain.terrain_proportions, name, float(name in kinds))
+        return env_cfg
+
+    grounds = ("smooth_slope_up", "stairs_up", "waves", "gaps")
+    shares = to_dict(cfg(*grounds).terrain.terrain_proportions)
+    shares = {f"terrain.terrain_proportions.{name}": 0.25 * share for name, share in shares.items()}
+    task = make_task("a1_rough_torque", 16, **MAP, **shares)
+    cfgs = [cfg("smooth_slope_up", "waves"), cfg("stairs_up", "waves")]
+    assert shared_out(cfgs, task) == [0] * 4 + [1] * 4 + [0, 1] * 4
+    members = [lambda obs, i=i: torch.full((16, ACTIONS), float(i)) for i in range(2)]
+    for member, settings in zip(members, cfgs, strict=True):
+        member.cfg = settings
+    assert Teachers(members, task)(None)[:, 0].tolist() == [0] * 4 + [1] * 4 + [0, 1] * 4
+
+
+@pytest.fixture(scope="module")
+def teacher(tmp_path_factory):
+    """Folder of logs with the run of a teacher, and its name."""
+    root = tmp_path_factory.mktemp("teacher")
+    assert run_here("train.py", *SMALL, *OF_TEACHER, root=root)[0] == 0
+    return root, next((root / "logs" / "a1_position").iterdir()).name
+
+
+def train(teacher, *words, more=()):
+    """Train a student; status, output, error, and the run's folder."""
+    root, name = teacher
+    before = set((root / "logs" / "a1_position").iterdir())
+    result = run_here("train.py", *SMALL, *OF_STUDENT, *words, f"--set=distillation.teachers=[{name}]", root=root)
+    return result, *sorted(set((root / "logs" / "a1_position").iterdir()) - before)
+
+
+def test_a_student_from_command_to_simulation(teacher):
+    """Training resumes with the same bits; the student is evaluated, exported and simulated elsewhere."""
+    (status, _, _), whole = train(teacher, "--max_iterations=4", "--run_name=whole")
+    assert status == 0
+    (status, output, _), half = train(teacher, "--max_iterations=2", "--run_name=half")
+    assert status == 0 and "Note: exports" not in output
+    root = teacher[0]
+    words = [f"--load_run={half}", "--resume", "--max_iterations=4", "--logger=none"]
+    assert run_here("train.py", *words, root=root)[0] == 0
+    first, second = (
+        dict(values(checkpoint.read(run / "model_4.pt", "checkpoint", "cpu")))
+        for run in (whole, max(half.parent.iterdir(), key=lambda path: path.stat().st_mtime))
+    )
+    assert len(first) > 40 and first["infos.worlds"] and not differences(first, second)
+    assert "push_robots: true" in (whole / "config.yaml").read_text()  # as the teacher's run
+    assert run_here("evaluate.py", f"--load_run={whole}", "--num_envs=2", "--steps=3", root=root)[0] == 0
+    assert run_here("export.py", f"--load_run={whole}", "--out=out", root=root)[0] == 0
+    assert run_here("sim2sim.py", "out", "--robots=1", "--steps=3", root=root)[0] == 0
+
+
+def test_refusals(teacher):
+    """No teacher, one that does not exist or is of another task or control, and settings that are not read."""
+    root, name = teacher
+    told = {
+        "--set=distillation.teachers=[]": "a student needs teachers",
+        "--set=distillation.teachers=[2020-01-01]": f"unknown run '2020-01-01'; allowed: {name}",
+        "--set=distillation.teachers=[other.pt]": "'other.pt' is no whole checkpoint",
+        "--set=control.action_scale=0.5": "has control.action_scale=",
+        "--set=distillation.gradient_length=3": "gradient_length must divide the 8 steps",
+        "--set=algorithm.learning_rate=1e-4": "is not read by legged_torque.learning.distillation:Distillation",
+        "--task=a1_torque": "is of task 'a1_position', not 'a1_torque'",
+    }
+    before = set(root.rglob("*"))
+    for word, message in told.items():
+        words = [*SMALL, *OF_STUDENT, f"--set=distillation.teachers=[logs/a1_position/{name}]", word]
+        if "[other" in word or "2020" in word:
+            words = [*SMALL, *OF_STUDENT, word]
+        assert_told_in_one_line(run_here("train.py", *words, root=root), message)
+    assert set(Path(root).rglob("*")) == before
