@@ -22,7 +22,7 @@ try:
 except ImportError as error:
     raise UserError(f"DDS needs the extra: pip install 'legged_torque[robot]' ({error})") from None
 
-TOPICS = {LowCmd_: "rt/lowcmd", LowState_: "rt/lowstate"}
+TOPICS: dict[type, str] = {LowCmd_: "rt/lowcmd", LowState_: "rt/lowstate"}
 DEPTH = 32  # messages that wait for the next look; at 500 Hz, 64 ms
 NUMBERS = 2**32  # numbers of messages start anew after these
 READER = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH))

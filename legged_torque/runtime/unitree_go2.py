@@ -180,10 +180,10 @@ _MEMBERS = {
 def _numbers(part: IdlStruct) -> Iterator[Any]:
     """Yield all numbers of a message or a part of one, in order."""
     for value in _MEMBERS[type(part)](part):
-        if isinstance(value, IdlStruct):
-            yield from _numbers(value)
-        elif not isinstance(value, (list, tuple)):
+        if isinstance(value, (int, float)):
             yield value
+        elif isinstance(value, IdlStruct):
+            yield from _numbers(value)
         elif isinstance(value[0], IdlStruct):
             for inner in value:
                 yield from _numbers(inner)
