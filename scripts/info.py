@@ -22,6 +22,7 @@ PURPOSES = {
     "video": "videos of play.py and sim2sim.py",
     "viewer": "play.py --viewer web",
     "export": "export.py, sim2sim.py",
+    "robot": "robots over DDS",
     "plots": "figures and report.py",
     "wandb": "--logger wandb",
     "ray": "experiment.py --launcher ray",

@@ -1,0 +1,61 @@
+"""What a robot says and is told, whatever carries it."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+
+@dataclass
+class RobotState:
+    """Measurements of a robot; joints in the robot's own order."""
+
+    tick: int  # number of the message; the next one is 1 more
+    quaternion: np.ndarray  # the trunk's orientation (w, x, y, z); (4,)
+    angular_velocity: np.ndarray  # of the trunk, in its own frame [rad/s]; (3,)
+    joint_positions: np.ndarray  # [rad]; (joints,)
+    joint_velocities: np.ndarray  # [rad/s]; (joints,)
+    joint_torques: np.ndarray  # as the drives estimate them [N m]; (joints,)
+    temperatures: np.ndarray  # of the motors [deg C]; (joints,)
+    errors: np.ndarray  # error flags of the motors, 0 is none; (joints,)
+
+
+@dataclass
+class MotorCommand:
+    """What each drive is told: torque = tau + kp (q - position) + kd (dq - velocity). Shapes: (joints,)."""
+
+    tau: np.ndarray  # [N m]
+    q: np.ndarray  # [rad]
+    dq: np.ndarray  # [rad/s]
+    kp: np.ndarray  # [N m/rad]
+    kd: np.ndarray  # [N m s/rad]
+
+
+@dataclass
+class Received:
+    """Messages of the other side since the last look."""
+
+    newest: RobotState | MotorCommand | None = None  # the last one that was whole; None if none came
+    wrong_crc: int = 0  # how many were damaged
+    lost: int = 0  # how many are missing by their numbers
+    late: int = 0  # how many came after a later one, and were dropped
+    problems: list[str] = field(default_factory=list)  # of another kind: mode, version
+
+
+class Transport(Protocol):
+    """The robot as the program sees it. A new one is one file.
+
+    Attributes:
+        joint_order: Names of the joints in the robot's own order.
+    """
+
+    joint_order: list[str]
+
+    def receive(self) -> Received:
+        """Return what the robot has said since the last call; never waits."""
+
+    def send(self, command: MotorCommand) -> None:
+        """Tell the drives."""
+
+    def close(self) -> None:
+        """Leave."""

@@ -1,0 +1,218 @@
+"""Both sides of a robot over DDS: two processes on loopback."""
+
+import importlib
+import os
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
+
+from legged_torque.runtime import unitree_go2 as go2
+from legged_torque.runtime.dds import Go2Robot, Go2Side
+from legged_torque.runtime.interface import MotorCommand
+from legged_torque.utils.errors import UserError
+
+DOMAIN = 100 + os.getpid() % 100  # each worker of pytest has its own
+OTHER_SIDE = """
+import sys, time
+import numpy as np
+from legged_torque.runtime import unitree_go2
+from legged_torque.runtime.dds import Go2Side
+from legged_torque.runtime.interface import RobotState
+
+side = Go2Side("lo", int(sys.argv[1]))
+for line in sys.stdin:  # numbers of the states to tell, 500 a second; of a negative one the CRC is wrong
+    start = time.monotonic()
+    for k, number in enumerate(int(word) for word in line.split()):
+        time.sleep(max(0.0, start + k / 500 - time.monotonic()))
+        message = unitree_go2.encode_state(RobotState(abs(number), np.zeros(4), np.zeros(3), *np.zeros((5, 12))))
+        message.crc ^= number < 0
+        side.publish(message)
+    heard = side.receive()
+    tau = heard.newest.tau[0] if heard.newest else np.nan
+    print(tau, heard.lost, heard.late, heard.wrong_crc, len(heard.problems), flush=True)
+"""
+
+
+class Robot:
+    """The other process."""
+
+    def __init__(self):
+        arguments = [sys.executable, "-c", OTHER_SIDE, str(DOMAIN)]
+        self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def tell(self, numbers):
+        """Have it tell states."""
+        print(*numbers, file=self.process.stdin, flush=True)
+
+    def heard(self):
+        """After it has told all: torque of the newest command, lost, late, with a wrong CRC, other problems."""
+        return [float(word) for word in self.process.stdout.readline().split()]
+
+    def told(self, numbers, transport):
+        """What is received of states that it tells."""
+        self.tell(numbers)
+        self.heard()
+        return looks(transport, 0.2)
+
+    def meet(self, transport):
+        """Wait until both sides have found each other, with messages that have no number: it is 0."""
+        for _ in range(200):
+            self.tell([0])
+            transport.publish(numbered(0))
+            found, heard = looks(transport, 0.03), self.heard()
+            if heard[0] == 0 and any(look.newest for look in found):
+                return
+        pytest.fail("the two sides have not met")
+
+
+@contextmanager
+def started():
+    """A robot, which leaves at the end."""
+    robot = Robot()
+    try:
+        yield robot
+    finally:
+        robot.process.communicate(timeout=10)
+
+
+@pytest.fixture
+def transport():
+    """This process's side."""
+    transport = Go2Robot("lo", DOMAIN)
+    yield transport
+    transport.close()
+
+
+@pytest.fixture
+def robot(transport):
+    """A robot that has been met."""
+    with started() as robot:
+        robot.meet(transport)
+        yield robot
+
+
+def torques(value):
+    """A command of one torque."""
+    idle = np.full(12, go2.NO_POSITION), np.full(12, go2.NO_VELOCITY), np.zeros(12), np.zeros(12)
+    return MotorCommand(np.full(12, value), *idle)
+
+
+def numbered(number):
+    """The message of a command whose torque is its number; of a negative one the CRC is wrong."""
+    message = go2.encode_command(torques(abs(number)), abs(number))
+    message.crc ^= number < 0
+    return message
+
+
+def looks(transport, seconds):
+    """What is received within a time, a look per millisecond."""
+    end, found = time.monotonic() + seconds, []
+    while time.monotonic() < end:
+        found.append(transport.receive())
+        time.sleep(0.001)
+    return found
+
+
+def counts(found):
+    """Lost and late messages, and those with a wrong CRC, of several looks."""
+    return [sum(getattr(look, name) for look in found) for name in ("lost", "late", "wrong_crc")]
+
+
+def test_states_arrive_in_order(robot, transport):
+    """A second at 500 Hz: later looks find later states up to the last; what a busy machine loses is counted."""
+    robot.tell(range(2, 502))
+    found, end = [], time.monotonic() + 10
+    while not (found and found[-1].newest and found[-1].newest.tick == 501) and time.monotonic() < end:
+        found += looks(transport, 0.001)
+    numbers = [look.newest.tick for look in found if look.newest]
+    assert numbers == sorted(set(numbers)) and numbers[-1] == 501
+    lost, late, wrong_crc = counts(found)
+    assert 100 < len(numbers) <= 500 - lost
+    assert late == wrong_crc == 0 and not any(look.problems for look in found)
+
+
+FAULTS = {
+    "none": ([2, 3, 4], [0, 0, 0]),
+    "dropped": ([2, 5, 6, 8], [3, 0, 0]),
+    "twice": ([2, 3, 3, 4], [0, 1, 0]),
+    "out of order": ([2, 4, 3, 5], [1, 1, 0]),
+    "damaged": ([2, -3, 4], [1, 0, 1]),
+}
+
+
+@pytest.mark.parametrize(("numbers", "expected"), FAULTS.values(), ids=FAULTS)
+def test_faults_are_counted(robot, transport, numbers, expected):
+    """On both sides: lost, late or repeated, and damaged messages; the newest whole one stays."""
+    found = robot.told(numbers, transport)
+    assert counts(found) == expected
+    assert [look.newest.tick for look in found if look.newest][-1] == numbers[-1]
+    for number in numbers:
+        transport.publish(numbered(number))
+    time.sleep(0.2)
+    robot.tell([])
+    assert robot.heard() == [numbers[-1], *expected, 0]
+
+
+def test_commands_are_numbered(robot, transport):
+    """What `send` numbers has no gap; messages of Unitree's own programs have no numbers, and are obeyed."""
+    for torque in (1.0, 2.0, 3.0):
+        transport.send(torques(torque))
+    time.sleep(0.2)
+    robot.tell([])
+    tau, lost, _, wrong_crc, problems = robot.heard()
+    assert [tau, lost, wrong_crc, problems] == [3, 0, 0, 0]
+    for torque in (4.0, 5.0):
+        transport.publish(go2.encode_command(torques(torque), 0))
+    time.sleep(0.2)
+    robot.tell([])
+    assert robot.heard() == [5, 0, 0, 0, 0]
+
+
+def test_robots_that_start_anew_and_two_at_once(transport):
+    """The numbers of a robot that has started again are its own; two robots at the same time are a problem."""
+    with started() as first:
+        first.meet(transport)
+        first.told([900], transport)
+        with started() as second:
+            second.meet(transport)
+            found = second.told([2, 3], transport)
+            assert counts(found) == [0, 0, 0] and not any(look.problems for look in found)
+            found = first.told([901], transport)
+            assert any("rt/lowstate" in problem for look in found for problem in look.problems)
+
+
+def test_nobody_there(transport, monkeypatch):
+    """Neither side waits for the other, and settings of the user's for other programs are not read."""
+    start = time.monotonic()
+    for _ in range(100):
+        transport.send(torques(0.0))
+        assert transport.receive().newest is None
+    assert time.monotonic() - start < 1.0  # the robot's rate is 500 Hz
+    transport.close()
+    monkeypatch.setenv("CYCLONEDDS_URI", "<no settings")
+    Go2Side("lo", DOMAIN).close()
+
+
+@pytest.mark.parametrize(
+    ("interface", "domain", "said"),
+    [("l0", 1, "'l0'; did you mean 'lo'"), ("lo", 233, "233"), ("lo", DOMAIN, "process")],
+)
+def test_what_dds_cannot_use(transport, interface, domain, said):
+    """An interface that does not exist, a domain too high, and one that this process is in already, are refused."""
+    with pytest.raises(UserError, match=said) as error:
+        Go2Side(interface, domain)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_package(monkeypatch):
+    """Without cyclonedds, one line names the extra."""
+    monkeypatch.delitem(sys.modules, "legged_torque.runtime.dds")
+    monkeypatch.setitem(sys.modules, "cyclonedds.core", None)
+    with pytest.raises(UserError, match=r"^[^\n]*'legged_torque\[robot\]'[^\n]*$"):
+        importlib.import_module("legged_torque.runtime.dds")

@@ -1,0 +1,177 @@
+"""Unitree's messages for Go2: bytes, CRC, round trips, and what is refused."""
+
+import dataclasses
+import struct
+
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
+
+from legged_torque.runtime import unitree_go2 as go2
+from legged_torque.runtime.interface import MotorCommand, RobotState
+
+RANGES = {"q": (-3.0, 3.0), "dq": (-30.0, 30.0), "tau": (-45.0, 45.0), "kp": (0.0, 100.0), "kd": (0.0, 5.0)}
+
+
+@pytest.fixture
+def rng():
+    """Random numbers, the same in each run."""
+    return np.random.default_rng(3)
+
+
+@pytest.fixture
+def command(rng):
+    """A command of plausible numbers."""
+    return MotorCommand(**{name: rng.uniform(low, high, 12).astype(np.float32) for name, (low, high) in RANGES.items()})
+
+
+@pytest.fixture
+def state(rng):
+    """A state of plausible numbers, temperatures in whole degrees."""
+    return RobotState(
+        7,
+        rng.normal(size=4).astype(np.float32),
+        rng.normal(size=3).astype(np.float32),
+        *rng.normal(size=(3, 12)).astype(np.float32),
+        temperatures=rng.integers(20, 90, 12).astype(np.float32),
+        errors=rng.integers(0, 2**32, 12, dtype=np.uint32),
+    )
+
+
+def shift_register(structures):
+    """CRC-32/MPEG-2 of packed messages bit by bit, as the catalogue of CRCs defines it; ``structures``: (n, bytes)."""
+    words = np.frombuffer(structures.tobytes(), "<u4").reshape(len(structures), -1)[:, :-1]
+    value = np.full(len(words), 0xFFFFFFFF, np.uint32)
+    for word in words.T:
+        value ^= word
+        for _ in range(32):
+            top = value >> np.uint32(31)
+            value = (value << np.uint32(1)) ^ (top * np.uint32(0x04C11DB7))
+    return value
+
+
+@pytest.mark.parametrize("size", [812, 1180])
+def test_crc(size, rng):
+    """The fast CRC is that of a shift register."""
+    structures = rng.integers(0, 256, (10_000, size), dtype=np.uint8)
+    assert [go2.crc(row.tobytes()) for row in structures] == shift_register(structures).tolist()
+
+
+def test_bytes_of_a_command(command):
+    """The packed message is the SDK's structure; unused motors are told to do nothing."""
+    message = go2.encode_command(command, 9)
+    told = zip(command.q, command.dq, command.tau, command.kp, command.kd, strict=True)
+    motors = [(1, *numbers, 0, 0, 0) for numbers in told]
+    motors += [(1, 2.146e9, 16000.0, 0.0, 0.0, 0.0, 0, 0, 0)] * 8
+    numbers = [0xFE, 0xEF, 0xFF, *[0] * 6, *[number for motor in motors for number in motor], *[0] * 59, 9, message.crc]
+    expected = struct.pack("<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55Bx2I", *numbers)
+    assert go2.packed(message) == expected and len(expected) == 812
+    assert message.crc == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
+
+
+def test_bytes_of_a_state(state):
+    """The packed message is the SDK's structure; its clock counts 2 ms per state."""
+    message = go2.encode_state(state)
+    imu = [*state.quaternion, *state.angular_velocity, *[0.0] * 6, 0]
+    measured = zip(state.joint_positions, state.joint_velocities, state.joint_torques, strict=True)
+    motors = [(1, q, dq, 0.0, tau, 0.0, 0.0, 0.0) for q, dq, tau in measured] + [(1, *[0.0] * 7)] * 8
+    ends = [(int(t), 0, int(e), 0) for t, e in zip(state.temperatures, state.errors, strict=True)] + [(0, 0, 0, 0)] * 8
+    moving = [number for motor, end in zip(motors, ends, strict=True) for number in (*motor, *end)]
+    battery_and_feet = [0] * (4 + 2 + 4 + 15 + 8)
+    rest = [14, *[0] * 41, 0.0, 0, 0, 0.0, 0.0, *[0] * 4, 0, message.crc]
+    layout = "<4B4IH2x" + "13fb3x" + "B3x7fb3x3I" * 20 + "4BiH4b15H" + "8hI41B3xf2b2x2f4h2I"
+    expected = struct.pack(layout, 0xFE, 0xEF, 0xFF, *[0] * 6, *imu, *moving, *battery_and_feet, *rest)
+    assert go2.packed(message) == expected and len(expected) == 1180
+    assert message.crc == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
+
+
+def assert_equal(one, other):
+    """Two commands or states are the same to the bit."""
+    for name, value in vars(one).items():
+        assert np.array_equal(value, getattr(other, name)), name
+
+
+def test_round_trips(command, state):
+    """Over the wire and back, float32 numbers stay as they are; the order is that of Unitree's legs and of exports."""
+    sent = go2.LowCmd_.deserialize(go2.encode_command(command, 1).serialize())
+    assert_equal(command, go2.decode_command(sent))
+    told = go2.LowState_.deserialize(go2.encode_state(state).serialize())
+    assert_equal(state, go2.decode_state(told))
+    assert go2.JOINT_ORDER[:4] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint"]
+    assert [name[:2] for name in go2.JOINT_ORDER[::3]] == ["FR", "FL", "RR", "RL"]
+
+
+def test_temperatures_are_whole_degrees(state):
+    """Degrees are rounded and held within a byte."""
+    state.temperatures = np.array([20.4, 20.6, -5.0, 300.0, *[30.0] * 8])
+    assert go2.decode_state(go2.encode_state(state)).temperatures[:5].tolist() == [20, 21, 0, 255, 30]
+
+
+def sealed(message):
+    """A message with the CRC of what it says."""
+    message.crc = go2.crc(go2.packed(message))
+    return message
+
+
+@pytest.mark.parametrize("bit", [0, 300, 811 * 8 - 40])
+def test_a_damaged_bit_is_seen(command, bit):
+    """A bit that flips on its way is a wrong CRC."""
+    data = bytearray(go2.encode_command(command, 1).serialize())
+    data[4 + bit // 8] ^= 1 << bit % 8
+    with pytest.raises(go2.CrcError):
+        go2.decode_command(go2.LowCmd_.deserialize(bytes(data)))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda message: setattr(message, "head", (1, 2)), "0102"),
+        (lambda message: setattr(message, "level_flag", 0xEE), "0xee"),
+        (lambda message: setattr(message.motor_cmd[4], "mode", 0x0A), "FL_thigh_joint 10"),
+        (lambda message: setattr(message.motor_cmd[11], "tau", np.nan), "tau"),
+        (lambda message: setattr(message.motor_cmd[0], "kp", np.inf), "kp"),
+    ],
+)
+def test_wrong_commands_are_refused(command, change, said):
+    """A command of another kind, or without a number, is refused by name though its CRC is right."""
+    message = go2.encode_command(command, 1)
+    change(message)
+    with pytest.raises(go2.MessageError, match=said) as error:
+        go2.decode_command(sealed(message))
+    assert not isinstance(error.value, go2.CrcError)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda message: setattr(message, "head", (0xFE, 0xEE)), "feee"),
+        (lambda message: setattr(message.motor_state[3], "mode", 0), "FL_hip_joint 0"),
+        (lambda message: setattr(message.motor_state[3], "q", np.nan), "joint_positions"),
+        (lambda message: setattr(message.imu_state, "quaternion", (1.0, 0.0, np.inf, 0.0)), "quaternion"),
+    ],
+)
+def test_wrong_states_are_refused(state, change, said):
+    """So is a state."""
+    message = go2.encode_state(state)
+    change(message)
+    with pytest.raises(go2.MessageError, match=said):
+        go2.decode_state(sealed(message))
+
+
+def test_states_of_unitree_mujoco(state):
+    """Its states have neither head nor modes, and are read."""
+    message = go2.encode_state(state)
+    message.head = (0, 0)
+    for motor in message.motor_state:
+        motor.mode = 0
+    assert_equal(state, go2.decode_state(sealed(message)))
+
+
+@pytest.mark.parametrize("value", [np.full(12, np.nan), np.full(12, 1e39), np.zeros(11), np.zeros((12, 1))])
+def test_what_the_wire_cannot_carry_is_not_sent(command, state, value):
+    """Numbers that are not finite as float32, or not one per joint, raise an error."""
+    with pytest.raises(go2.MessageError, match="kd"):
+        go2.encode_command(dataclasses.replace(command, kd=value), 1)
+    with pytest.raises(go2.MessageError, match="joint_torques"):
+        go2.encode_state(dataclasses.replace(state, joint_torques=value))
