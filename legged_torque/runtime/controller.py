@@ -1,0 +1,221 @@
+"""What a robot does: nothing, damping, standing up, or a policy; any fault ends in damping."""
+
+import threading
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from legged_torque.deploy.policy import Policy, State
+from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake, torques_of
+from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.utils.errors import UserError, refuse, unknown_name
+
+
+class Mode(Enum):
+    """What the robot does."""
+
+    PASSIVE = "passive"  # no torque at all
+    DAMPING = "damping"  # drives slow the joints down
+    STAND = "stand"  # the joints move to the nominal pose, and stay there
+    POLICY = "policy"
+
+
+class Controller:
+    """Makes the command of each tick from what the robot has said; knows neither clock nor wire.
+
+    The operator may call :meth:`request` from another thread.
+
+    The drives close the loop of a policy's position targets themselves, with the policy's gains; its torques are sent
+    as feed-forward torques.
+
+    Attributes:
+        mode: What the robot does.
+        reason: Why it was stopped; empty if it was not.
+        joints: Limits of the robot's joints, in its own order.
+        state: The newest state; None before the first.
+        velocity_command: v_x, v_y [m/s] and yaw rate [rad/s] for the policy. Shape: (3,).
+        sent: The last command.
+        period: Time between two ticks [s].
+    """
+
+    def __init__(self, policy: Policy, joint_order: list[str], rate: float, brakes: Brakes | None = None) -> None:
+        """Prepare to drive a robot.
+
+        A UserError if robot and policy have different joints, or ``rate`` is no multiple of the policy's.
+
+        Args:
+            policy: The policy.
+            joint_order: Names of the robot's joints, in its own order.
+            rate: Ticks per second.
+            brakes: Limits; None takes the defaults.
+        """
+        self.policy, self.brakes, self.period = policy, brakes or Brakes(), 1.0 / rate
+        self._ticks_per_action = round(rate / policy.description["timing"]["control_frequency"])
+        if abs(rate - self._ticks_per_action * policy.description["timing"]["control_frequency"]) > 1e-6 * rate:
+            of_policy = policy.description["timing"]["control_frequency"]
+            raise UserError(f"--rate must be a multiple of the policy's {of_policy:g} Hz, not {rate:g}")
+        self._find_joints(joint_order)
+        self.mode, self.reason = Mode.DAMPING, ""
+        self.state: RobotState | None = None
+        self.velocity_command = np.zeros(3)
+        self._since, self._state_time, self._now, self._missed, self._damaged = 0.0, -np.inf, 0.0, 0, 0
+        self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
+        self.sent, self._lock = self._gentle(0.0), threading.Lock()
+
+    def _find_joints(self, joint_order: list[str]) -> None:
+        """Put the limits of the policy's joints into the robot's order; a UserError if it needs what is not there."""
+        policy, joints = self.policy, self.policy.description["joints"]
+        refuse(
+            [
+                str(unknown_name("joint of the policy on the robot", name, joint_order))
+                for name in policy.joint_order
+                if name not in joint_order
+            ]
+        )
+        refuse(
+            [
+                f"the policy does not know the robot's joint '{name}'"
+                for name in joint_order
+                if name not in policy.joint_order
+            ]
+        )
+        if not all("range" in joints[name] for name in joint_order):
+            raise UserError("policy.yaml lacks the ranges of the joints: export the policy anew")
+        self._order = np.array([policy.joint_order.index(name) for name in joint_order])  # of the policy's vectors
+        ranges = np.array([joints[name]["range"] for name in joint_order], float).T
+        speeds = np.array([joints[name]["max_velocity"] for name in joint_order], float)
+        self.joints = Joints(joint_order, policy.torque_limits[:, self._order].astype(float), ranges, speeds)
+        self._nominal_pose = policy.nominal_pose[self._order].astype(float)
+        if policy.supplied or policy.scan:
+            missing = [*policy.supplied, *(["height_scan"] if policy.scan else [])]
+            raise UserError(f"the policy observes {', '.join(missing)}, which this robot does not measure")
+        terms = [term["name"] for term in policy.description["actions"]["terms"]]
+        if not {*terms} <= {"position_residual", "torque"}:
+            raise UserError(f"a robot's drives know position_residual and torque, not the terms {', '.join(terms)}")
+
+    # ---- the operator ------------------------------------------------------------------------------------------------
+
+    def request(self, mode: Mode) -> str:
+        """Change what the robot does, and return why that is refused; empty if it is done.
+
+        Damping and passivity are never refused. After a fault the robot must stand before it walks.
+        """
+        with self._lock:
+            stands = self.mode == Mode.STAND and self._now - self._since >= self.brakes.stand_up
+            if mode == Mode.POLICY and not stands:
+                return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
+            if mode == Mode.STAND and (problem := self._fault(Received())):
+                return problem
+            self._enter(mode)
+            self.reason = ""
+        return ""
+
+    def stop(self, reason: str) -> None:
+        """End in damping for a reason."""
+        if self.mode in (Mode.STAND, Mode.POLICY):
+            self._enter(Mode.DAMPING)
+            self.reason = reason
+
+    def _enter(self, mode: Mode) -> None:
+        """Begin with a mode."""
+        self.mode, self._since, self._tick = mode, self._now, 0
+        if self.state is not None:
+            self._from = self.state.joint_positions.copy()
+        if mode == Mode.POLICY:
+            self.policy.reset()
+
+    # ---- a tick ------------------------------------------------------------------------------------------------------
+
+    def step(self, received: Received, now: float, missed: bool = False) -> MotorCommand:
+        """Return the command of a tick.
+
+        Args:
+            received: What the robot has said since the last tick.
+            now: The time [s].
+            missed: Whether the last deadline was missed.
+        """
+        with self._lock:
+            try:
+                self.sent = self._step(received, now, missed)
+            except Exception as error:  # whatever it is, the robot must not be left without a command
+                self.stop(str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
+                self.sent = self._gentle(self.brakes.damping)
+            return self.sent
+
+    def _step(self, received: Received, now: float, missed: bool) -> MotorCommand:
+        """Do what :meth:`step` says, if all goes well."""
+        self._now, self._missed = now, self._missed + 1 if missed else 0
+        if isinstance(received.newest, RobotState):
+            self.state, self._state_time, self._damaged = received.newest, now, 0
+        self._damaged += received.wrong_crc
+        if problem := self._fault(received):
+            self.stop(problem)
+        if self.mode in (Mode.STAND, Mode.POLICY) and self.state is not None:
+            return self._moving(self.state)
+        return self._gentle(0.0 if self.mode == Mode.PASSIVE else self.brakes.damping)
+
+    def _moving(self, state: RobotState) -> MotorCommand:
+        """Return the command of a robot that stands or walks, within its limits; damping if it cannot be meant."""
+        command = self._standing(self._now - self._since) if self.mode == Mode.STAND else self._walking(state)
+        if problem := mistake(command, state, self.joints):
+            self.stop(problem)
+            return self._gentle(self.brakes.damping)
+        before = np.clip(torques_of(self.sent, state), *self.joints.torque_limits)
+        return limited(command, state, before, self.brakes.torque_rate * self.period, self.joints)
+
+    def _fault(self, received: Received) -> str:
+        """Return why the robot must not move."""
+        if self.state is None:
+            return "the robot has not said anything yet"
+        if self._missed > self.brakes.max_missed:
+            return f"{self._missed} deadlines were missed in a row"
+        seen = Received(None, self._damaged, problems=received.problems)
+        return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)
+
+    def _gentle(self, damping: float) -> MotorCommand:
+        """Return a command without targets, whose damping is within the limits at the last known speeds."""
+        zeros = np.zeros(len(self.joints.names))
+        speeds = np.abs(self.state.joint_velocities) if self.state is not None else zeros
+        most = np.abs(self.joints.torque_limits).min(axis=0) / np.maximum(np.nan_to_num(speeds), 1e-6)
+        return MotorCommand(zeros, zeros, zeros, zeros, np.minimum(damping, most))
+
+    def _standing(self, seconds: float) -> MotorCommand:
+        """Return the command on the way from where the joints were to the nominal pose, smooth at both ends."""
+        share = np.clip(seconds / self.brakes.stand_up, 0.0, 1.0)
+        target = self._from + share * share * (3.0 - 2.0 * share) * (self._nominal_pose - self._from)
+        zeros, (kp, kd) = np.zeros_like(target), self.brakes.stand_gains
+        return MotorCommand(zeros, target, zeros, zeros + kp, zeros + kd)
+
+    def _walking(self, state: RobotState) -> MotorCommand:
+        """Return the policy's command; at first it takes over from standing bit by bit."""
+        policy, to_policy = self.policy, np.argsort(self._order)
+        if self._tick % self._ticks_per_action == 0:
+            seen = State(
+                state.angular_velocity,
+                state.joint_positions[to_policy],
+                state.joint_velocities[to_policy],
+                quaternion=state.quaternion,
+            )
+            self._actions = policy.act(policy.observation(seen, self.velocity_command))
+        self._tick += 1
+        command = drive_command(policy, self._actions)
+        command = MotorCommand(*(part[self._order].astype(float) for part in vars(command).values()))
+        share = min(1.0, (self._now - self._since) / self.brakes.ramp)
+        standing = self._standing(np.inf)
+        parts = zip(vars(standing).values(), vars(command).values(), strict=True)
+        return MotorCommand(*((1.0 - share) * old + share * new for old, new in parts))
+
+
+def drive_command(policy: Policy, actions: np.ndarray) -> MotorCommand:
+    """Return what drives do for actions, in the policy's order: the same law as ``Policy.wanted_torques``."""
+    joints = len(policy.joint_order)
+    tau, q, kp, kd = np.zeros(joints), policy.nominal_pose.astype(float), np.zeros(joints), np.zeros(joints)
+    term: dict[str, Any]
+    for term, values in zip(policy.description["actions"]["terms"], actions.reshape(-1, joints), strict=True):
+        scaled, weight = term["scale"] * values.astype(float), term["mixing_weight"]
+        if term["name"] == "torque":
+            tau += weight * scaled
+        else:
+            q, kp, kd = q + scaled, weight * policy.stiffness, weight * policy.damping
+    return MotorCommand(tau, q, np.zeros(joints), kp, kd)

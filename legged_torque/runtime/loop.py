@@ -1,0 +1,73 @@
+"""A loop with absolute deadlines, in a thread of its own."""
+
+import gc
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+MISSED = 0.5  # of a period: a tick that ends this much after its deadline has missed it
+BIN, BINS = 1e-5, 5000  # of the histogram of lateness: width [s], and number; the last one is for all that is later
+SWITCH = 1e-4  # seconds after which another thread gives way to the loop; Python's default is 5 ms
+
+
+class RealTimeLoop:
+    """Calls a function at a fixed rate, without drift.
+
+    Attributes:
+        ticks: How many there were.
+        error: What has ended the loop; None if it was asked to end.
+    """
+
+    ticks = 0
+    error: BaseException | None = None
+
+    def __init__(self, rate: float, tick: Callable[[float, bool], None]) -> None:
+        """Prepare to call ``tick`` with the time [s] and whether the deadline before was missed, ``rate`` a second."""
+        self._period, self._tick, self._ended = 1.0 / rate, tick, threading.Event()
+        self._histogram = np.zeros(BINS, np.int64)
+        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+
+    def lateness(self, share: float) -> float:
+        """Return within which time of theirs a share of the ticks have begun [s]."""
+        place = int(np.searchsorted(self._histogram.cumsum(), share * self.ticks))
+        return min(place + 1, BINS) * BIN
+
+    def __enter__(self) -> "RealTimeLoop":
+        """Start, without pauses of the garbage collector."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        self._switch = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """End after the present tick."""
+        self._ended.set()
+        self._thread.join()
+        sys.setswitchinterval(self._switch)
+        gc.enable()
+        gc.unfreeze()
+
+    def _run(self) -> None:
+        """Tick until the end."""
+        due, missed = time.monotonic(), False
+        try:
+            while not self._ended.is_set():
+                begin = time.monotonic()
+                self._histogram[min(int((begin - due) / BIN), BINS - 1)] += 1
+                self.ticks += 1
+                self._tick(begin, missed)
+                due += self._period
+                left = due - time.monotonic()
+                missed = left < -MISSED * self._period
+                if missed:
+                    due = time.monotonic()  # what was missed is not caught up
+                else:
+                    time.sleep(max(left, 0.0))
+        except BaseException as error:
+            self.error = error

@@ -1,0 +1,63 @@
+"""A policy on a robot: control loop, counts, and a line for the operator."""
+
+import time
+from collections import Counter
+
+import numpy as np
+
+from legged_torque.runtime.brakes import torques_of
+from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.interface import Transport
+from legged_torque.runtime.loop import RealTimeLoop
+
+FAREWELL = 0.1  # seconds in which damping is sent at the end
+
+
+class Session:
+    """Connects a controller with a robot.
+
+    Attributes:
+        controller: The controller.
+        counts: Messages, and those that were damaged, lost or late.
+        stops: Reasons of all stops, in order.
+    """
+
+    def __init__(self, controller: Controller, transport: Transport) -> None:
+        """Prepare; nothing is sent yet."""
+        self.controller, self._transport = controller, transport
+        self.counts: Counter[str] = Counter()
+        self.stops: list[str] = []
+
+    def tick(self, now: float, missed: bool) -> None:
+        """Listen, decide, and tell the drives; see :class:`RealTimeLoop`."""
+        received = self._transport.receive()
+        new = {"messages": int(received.newest is not None), "damaged": received.wrong_crc}
+        self.counts.update(new | {"lost": received.lost, "late": received.late, "missed deadlines": int(missed)})
+        before = self.controller.reason
+        self._transport.send(self.controller.step(received, now, missed))
+        if self.controller.reason and self.controller.reason != before:
+            self.stops.append(self.controller.reason)
+
+    def close(self) -> None:
+        """Leave the robot in damping, after the loop has ended."""
+        self.controller.request(Mode.DAMPING)
+        end = time.monotonic() + FAREWELL
+        while time.monotonic() < end:
+            self.tick(time.monotonic(), missed=False)
+            time.sleep(self.controller.period)
+        self._transport.close()
+
+    def line(self, loop: RealTimeLoop) -> str:
+        """Return the state in a line: mode, command, torques against limits, temperature, ticks, messages."""
+        controller, state = self.controller, self.controller.state
+        parts = [controller.mode.value + (f" ({controller.reason})" if controller.reason else "")]
+        parts.append("command " + " ".join(f"{part:+.2f}" for part in controller.velocity_command))
+        if state is not None:
+            limits = np.abs(controller.joints.torque_limits).max(axis=0)
+            share = np.abs(torques_of(controller.sent, state)) / limits
+            worst = int(np.argmax(share))
+            parts.append(f"torque {share[worst]:.0%} of {controller.joints.names[worst]}'s limit")
+            parts.append(f"motors {state.temperatures.max():.0f} deg C")
+        parts.append(f"ticks {loop.ticks}, 99.9% within {1e3 * loop.lateness(0.999):.2f} ms")
+        parts += [f"{name} {count}" for name, count in self.counts.items() if count and name != "messages"]
+        return "; ".join(parts)

@@ -1,0 +1,136 @@
+"""The other side: a robot in plain MuJoCo with drives, a watchdog and faults, that speaks a robot's messages."""
+
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.utils.mjcf import loading
+
+WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
+DAMPING = 3.0  # of the drives then [N m s/rad]
+STEP = 1e-3  # of the physics, at which the drives close their loops [s]
+TOLERANCE = 1e-6  # of torques beyond limits [N m]
+
+
+@dataclass
+class Faults:
+    """What is wrong with the robot; nothing at first."""
+
+    lost: float = 0.0  # share of its messages that do not arrive
+    delay: float = 0.0  # by which they are late [s]
+    damaged: float = 0.0  # share of its messages with a wrong checksum
+    dead: list[str] = field(default_factory=list)  # joints without torque
+    hot: list[str] = field(default_factory=list)  # joints whose motors say 120 deg C
+    error: list[str] = field(default_factory=list)  # joints whose motors raise an error flag
+    not_finite: bool = False  # whether a joint's position is NaN
+    silent: bool = False  # whether it says nothing at all
+
+
+class SimRobot:
+    """A robot of an MJCF, whose drives do what Unitree's do, at the rate of the physics.
+
+    A drive gives tau + kp (q - position) + kd (dq - velocity) within its torque limit. Without commands it damps.
+
+    Attributes:
+        joint_order: Names of the joints.
+        model: MuJoCo's model.
+        data: Its state.
+        faults: What is wrong.
+        watchdog_ticks: Messages that were sent while the watchdog damped, after the first command.
+        excess: Largest torque beyond a limit that a command has asked for in the state in which it arrived [N m].
+        is_damping: Whether the drives only damp now.
+    """
+
+    def __init__(self, xml: Path, joint_order: list[str], rate: float, seed: int = 0) -> None:
+        """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second."""
+        with loading(xml):
+            spec = mujoco.MjSpec.from_file(str(xml))
+            floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], name="runtime floor")
+            floor.contype = floor.conaffinity = 1
+            spec.option.timestep = STEP
+            self.model = spec.compile()
+        self.data, self.joint_order = mujoco.MjData(self.model), joint_order
+        joints = [self.model.joint(name) for name in joint_order]
+        self._qpos = np.array([joint.qposadr[0] for joint in joints])
+        self._dofs = np.array([joint.dofadr[0] for joint in joints])
+        owners = self.model.actuator_trnid[:, 0].tolist()
+        self._motors = np.array([owners.index(joint.id) for joint in joints])
+        self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
+        self._steps, self._rng, self.faults = round(1.0 / (rate * STEP)), np.random.default_rng(seed), Faults()
+        self.watchdog_ticks, self.excess, self.is_damping = 0, 0.0, True
+        self._command: MotorCommand | None = None
+        self._age, self._tick = np.inf, 0
+        self._late: deque[tuple[float, RobotState]] = deque()
+        self._applied = np.zeros(len(joint_order))
+        self.lie_down()
+
+    def lie_down(self) -> None:
+        """Lay the robot on its belly, with folded legs."""
+        mujoco.mj_resetData(self.model, self.data)
+        low, high = self.model.jnt_range[[self.model.joint(name).id for name in self.joint_order]].T
+        folded = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}
+        pose = [next(angle for part, angle in folded.items() if part in name) for name in self.joint_order]
+        self.data.qpos[self._qpos], self.data.qpos[2] = np.clip(pose, low, high), 0.15
+        mujoco.mj_forward(self.model, self.data)
+
+    def push(self, velocity: tuple[float, float, float]) -> None:
+        """Add a velocity to that of the trunk, in the world [m/s]."""
+        self.data.qvel[:3] += velocity
+
+    def has_fallen(self) -> bool:
+        """Return whether the trunk lies on its side or its back."""
+        return bool(self.data.xmat[1].reshape(3, 3)[2, 2] < 0.3)
+
+    def step(self, received: Received) -> None:
+        """Move on for the time between two messages, under the newest command."""
+        period = self._steps * STEP
+        self._age += period
+        if isinstance(received.newest, MotorCommand):
+            self._command, self._age = received.newest, 0.0
+            asked = self._torques(received.newest)
+            low, high = self.limits
+            self.excess = max(self.excess, float(np.maximum(asked - high, low - asked).max()))
+        self.is_damping = self._command is None or self._age > WATCHDOG
+        self.watchdog_ticks += self._command is not None and self.is_damping
+        zeros = np.zeros(len(self.joint_order))
+        command = self._command if self._command and not self.is_damping else None
+        command = command or MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING)
+        is_dead = np.isin(self.joint_order, self.faults.dead)
+        for _ in range(self._steps):
+            self._applied = np.where(is_dead, 0.0, np.clip(self._torques(command), *self.limits))
+            self.data.ctrl[self._motors] = self._applied
+            mujoco.mj_step(self.model, self.data)
+
+    def _torques(self, command: MotorCommand) -> np.ndarray:
+        """Return what the drives are asked for now [N m]."""
+        error = command.q - self.data.qpos[self._qpos]
+        return command.tau + command.kp * error + command.kd * (command.dq - self.data.qvel[self._dofs])
+
+    def says(self) -> tuple[RobotState | None, bool]:
+        """Return the next message, or none if it is lost or late, and whether it is to be damaged on its way."""
+        faults, names = self.faults, np.array(self.joint_order)
+        self._tick += 1
+        positions = self.data.qpos[self._qpos].copy()
+        if faults.not_finite:
+            positions[0] = np.nan
+        state = RobotState(
+            tick=self._tick,
+            quaternion=self.data.qpos[3:7].copy(),
+            angular_velocity=self.data.qvel[3:6].copy(),
+            joint_positions=positions,
+            joint_velocities=self.data.qvel[self._dofs].copy(),
+            joint_torques=self._applied.copy(),
+            temperatures=np.where(np.isin(names, faults.hot), 120.0, 40.0),
+            errors=np.isin(names, faults.error).astype(int),
+        )
+        self._late.append((self.data.time + faults.delay, state))
+        if faults.silent or self._rng.random() < faults.lost:
+            self._late.pop()
+        arrived = None
+        while self._late and self._late[0][0] <= self.data.time + 1e-9:
+            arrived = self._late.popleft()[1]
+        return arrived, bool(self._rng.random() < faults.damaged)

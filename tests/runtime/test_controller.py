@@ -1,0 +1,191 @@
+"""The control of a robot, in step with a simulated one: what drives do, standing up, walking, faults of all kinds."""
+
+import numpy as np
+import pytest
+from support.exports import export_random
+
+from legged_torque import resource_path
+from legged_torque.deploy.policy import Policy
+from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
+from legged_torque.runtime.controller import Controller, Mode, drive_command
+from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.runtime.sim_robot import Faults, SimRobot
+from legged_torque.utils.errors import UserError
+
+RATE = 500.0
+ALLOWED = round(0.02 * RATE)  # ticks until a fault must have ended in damping
+TRIALS = 5  # of each fault
+
+
+@pytest.fixture(scope="module")
+def policy(make_task, tmp_path_factory):
+    """A random policy with both kinds of actions, small enough to stand with."""
+    folder = tmp_path_factory.mktemp("runtime") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return Policy(folder)
+
+
+class World:
+    """A robot, its controller, and the time."""
+
+    def __init__(self, policy, brakes=None):
+        order = list(reversed(policy.joint_order))  # a robot has an order of its own
+        self.robot = SimRobot(resource_path(policy.description["robot"]["file"]), order, RATE)
+        self.wire, self.ticks = InProcess(self.robot), 0
+        self.controller = Controller(policy, order, RATE, brakes)
+
+    def run(self, ticks, missed=False):
+        """Some ticks; the mode at the end."""
+        for _ in range(ticks):
+            self.ticks += 1
+            self.wire.send(self.controller.step(self.wire.receive(), self.ticks / RATE, missed))
+        return self.controller.mode
+
+    def stand(self):
+        """Stand up from lying."""
+        self.run(5)
+        assert self.controller.request(Mode.STAND) == ""
+        self.run(round(3.5 * RATE))
+        return self
+
+
+def random_state(rng, joints=12):
+    """A state of a robot that stands, with joints anywhere near."""
+    q, dq, zeros = rng.normal(0.0, 0.5, joints), rng.normal(0.0, 5.0, joints), np.zeros(joints)
+    return RobotState(1, np.array([1.0, 0, 0, 0]), np.zeros(3), q, dq, zeros, zeros, zeros.astype(int))
+
+
+def test_drives_do_what_the_policy_wants(policy):
+    """Feed-forward torques and gains give in any state the torques of the policy's law."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        actions, state = rng.normal(0.0, 2.0, 24).astype(np.float32), random_state(rng)
+        expected = policy.wanted_torques(actions, state.joint_positions, state.joint_velocities)
+        np.testing.assert_allclose(torques_of(drive_command(policy, actions), state), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_torques_stay_within_limits_and_change_slowly():
+    """Whatever is asked for; within both, nothing changes."""
+    rng = np.random.default_rng(0)
+    limits = np.array([[-20.0] * 12, [30.0] * 12])
+    joints = Joints([f"joint {i}" for i in range(12)], limits, 100 * limits, limits[1])
+    for scale in (1.0, 1e2, 1e4):
+        for _ in range(20):
+            state, before = random_state(rng), rng.uniform(*limits)
+            command = MotorCommand(*(scale * rng.normal(size=12) for _ in range(5)))
+            result = torques_of(limited(command, state, before, 4.0, joints), state)
+            tolerance = 1e-9 * scale**2 * 100
+            assert (result >= limits[0] - tolerance).all() and (result <= limits[1] + tolerance).all()
+            assert (np.abs(result - before) <= 4.0 + tolerance).all()
+            asked = torques_of(command, state)
+            is_allowed = (np.abs(asked - before) < 4.0) & (asked > limits[0]) & (asked < limits[1])
+            np.testing.assert_allclose(result[is_allowed], asked[is_allowed], rtol=1e-9)
+
+
+def test_tilt():
+    """Turned by some angle about any level axis, and about the vertical one."""
+    for angle in (0.0, 0.3, 1.0, 2.5):
+        half, axis = angle / 2.0, np.array([0.6, 0.8, 0.0])
+        rolled = np.array([np.cos(half), *(np.sin(half) * axis)])
+        assert tilt_of(rolled) == pytest.approx(angle, abs=1e-6)
+        assert tilt_of(np.array([np.cos(half), 0.0, 0.0, np.sin(half)])) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_from_lying_to_walking_and_back(policy):
+    """A robot stands up into the nominal pose, hands over to the policy only then, and lies down in damping."""
+    world = World(policy)
+    assert world.run(10) == Mode.DAMPING
+    assert "stands" in world.controller.request(Mode.POLICY)
+    world.stand()
+    joints, trunk = world.robot.data.qpos[7:], world.robot.data.qpos[2]
+    nominal = [policy.description["nominal_pose"][name] for name in policy.joint_order]
+    order = [world.robot.model.joint(i).name for i in range(1, 13)]
+    assert np.abs(joints - [nominal[policy.joint_order.index(name)] for name in order]).max() < 0.2
+    assert trunk > 0.25 and world.robot.excess <= 1e-6
+    assert world.controller.request(Mode.POLICY) == "" and world.run(25) == Mode.POLICY
+    assert world.controller.request(Mode.DAMPING) == ""
+    assert world.run(round(3 * RATE)) == Mode.DAMPING and world.robot.data.qpos[2] < 0.2
+    assert not world.controller.sent.kp.any() and not world.controller.sent.tau.any()
+
+
+def test_the_wrong_robot(policy):
+    """Joints that one of both does not know, an export without ranges, and rates that do not fit are refused."""
+    order = policy.joint_order
+    for wrong in (order[:-1], [*order, "tail"], ["FR_hp_joint", *order[1:]]):
+        with pytest.raises(UserError, match="joint"):
+            Controller(policy, wrong, RATE)
+    with pytest.raises(UserError, match="multiple of the policy's 50 Hz"):
+        Controller(policy, order, 490.0)
+    had = policy.description["joints"][order[3]].pop("range")
+    with pytest.raises(UserError, match="export the policy anew"):
+        Controller(policy, order, RATE)
+    policy.description["joints"][order[3]]["range"] = had
+    policy.supplied = ["felt"]
+    with pytest.raises(UserError, match="observes felt"):
+        Controller(policy, order, RATE)
+    policy.supplied = []
+
+
+def turned(world):
+    """Lay the robot on its side."""
+    world.robot.data.qpos[3:7] = [np.cos(0.7), np.sin(0.7), 0.0, 0.0]
+
+
+def no_number(world):
+    """Let the network fail."""
+    session = world.controller.policy.session
+    world.controller.policy.session = type("Broken", (), {"run": lambda *_: [np.full((1, 24), np.nan, np.float32)]})()
+    return lambda: setattr(world.controller.policy, "session", session)
+
+
+FAULTS = {
+    "silent": lambda world: setattr(world.robot.faults, "silent", True),
+    "late": lambda world: setattr(world.robot.faults, "delay", 0.1),
+    "damaged": lambda world: setattr(world.robot.faults, "damaged", 1.0),
+    "not finite": lambda world: setattr(world.robot.faults, "not_finite", True),
+    "hot": lambda world: world.robot.faults.hot.append("RR_calf_joint"),
+    "error flag": lambda world: world.robot.faults.error.append("FL_hip_joint"),
+    "tilted": turned,
+    "too fast": lambda world: world.robot.data.qvel.__setitem__(slice(6, 9), 200.0),
+    "beyond its range": lambda world: world.robot.data.qpos.__setitem__(9, 0.6),
+    "network": no_number,
+    "program": lambda world: setattr(world.controller.brakes, "max_tilt", "a mistake in the program"),
+    "operator": lambda world: world.controller.request(Mode.DAMPING) and None,
+}
+
+
+def test_every_fault_ends_in_damping(policy):
+    """At random moments of standing and walking, within 20 ms, without a torque beyond limits on the robot's side."""
+    rng, world = np.random.default_rng(0), World(policy, Brakes(stand_up=0.02))
+    qpos = World(policy).stand().robot.data.qpos.copy()
+    for trial in range(TRIALS * len(FAULTS)):
+        name = list(FAULTS)[trial % len(FAULTS)]
+        world.robot.faults, world.controller.brakes.max_tilt = Faults(), Brakes.max_tilt
+        world.run(60)  # until all that was late has come
+        world.robot.data.qpos[:], world.robot.data.qvel[:] = qpos, 0.0
+        world.run(2)
+        assert world.controller.request(Mode.STAND) == "", name
+        assert world.run(15) == Mode.STAND
+        if walks := name == "network" or rng.random() < 0.5:
+            assert world.controller.request(Mode.POLICY) == ""
+        assert world.run(int(rng.integers(1, 12))) == (Mode.POLICY if walks else Mode.STAND), name
+        mend = FAULTS[name](world)
+        assert world.run(ALLOWED) == Mode.DAMPING, name
+        assert world.controller.reason or name == "operator"
+        assert not world.controller.sent.kp.any() and world.controller.sent.kd.all()
+        if mend:
+            mend()
+    assert world.robot.excess <= 1e-6
+
+
+def test_missed_deadlines_and_a_dead_program(policy):
+    """A program that is late damps; one that says nothing more leaves a robot that damps itself."""
+    world = World(policy).stand()
+    assert world.run(Brakes.max_missed, missed=True) == Mode.STAND
+    assert world.run(1, missed=True) == Mode.DAMPING and "deadlines" in world.controller.reason
+    world.run(1)
+    assert not world.robot.is_damping
+    for _ in range(ALLOWED + 1):
+        world.robot.step(Received())
+    assert world.robot.is_damping and world.robot.watchdog_ticks

@@ -1,0 +1,124 @@
+"""A policy on a simulated Go2 in another process, over DDS, and the scripts of both sides."""
+
+import os
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from support.exports import export_random
+from support.scripts import assert_told_in_one_line, run_here
+
+pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
+
+from legged_torque import resource_path
+from legged_torque.deploy.policy import Policy
+from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.dds import Go2Robot
+from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.sim_robot import SimRobot
+
+RATE, DOMAIN = 500.0, 100 + os.getpid() % 100
+SIDE = """
+import sys, time
+from pathlib import Path
+from legged_torque.runtime.dds import Go2Side
+from legged_torque.runtime.sim_robot import SimRobot
+
+side = Go2Side("lo", int(sys.argv[1]))
+robot = SimRobot(Path(sys.argv[2]), side.joint_order, 500.0)
+state, heard = robot.says()[0], None
+while True:  # it moves on with each command, and repeats itself until the next one comes
+    side.send(state)
+    received = side.receive()
+    if received.newest is None:
+        time.sleep(1e-3)
+        continue
+    robot.step(received)
+    state = robot.says()[0]
+    print(*robot.data.qpos[:3], robot.excess, robot.watchdog_ticks, flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def exported(make_task, tmp_path_factory):
+    """Folder of a random policy of a Go2."""
+    folder = tmp_path_factory.mktemp("deploy") / "out"
+    export_random(make_task, "go2_torque_multihead", folder)
+    return folder
+
+
+def walk(transport, policy, ticks):
+    """Stand up, then let the policy act."""
+    controller = Controller(policy, transport.joint_order, RATE)
+    meet(transport, controller)
+    for tick in range(ticks):
+        transport.send(controller.step(next_state(transport, controller), tick / RATE))
+        if tick == 5:
+            assert controller.request(Mode.STAND) == ""
+        if tick == round(3.2 * RATE):
+            assert controller.request(Mode.POLICY) == ""
+    return controller
+
+
+def next_state(transport, controller):
+    """Wait for it, without the pauses of tests that wait for a page; what was lost is said again."""
+    end = time.monotonic() + 60.0
+    while time.monotonic() < end:
+        again = time.monotonic() + 0.1
+        while time.monotonic() < again:
+            if (received := transport.receive()).newest is not None:
+                return received
+            time.sleep(1e-4)
+        transport.send(controller.sent)
+    raise AssertionError("the robot says nothing")
+
+
+def meet(transport, controller):
+    """Tell the robot to damp until it obeys: the first messages are lost while both sides look for each other."""
+    first = next_state(transport, controller).newest.tick
+    while next_state(transport, controller).newest.tick == first:
+        pass
+
+
+def test_over_the_wire_as_in_process(exported, tmp_path):
+    """A robot in another process ends where one in this process does; the wire rounds to float32."""
+    policy, ticks, xml = Policy(exported), round(3.3 * RATE), resource_path("resources/robots/go2/go2.xml")
+    command = [sys.executable, "-c", SIDE, str(DOMAIN), str(xml)]
+    with (tmp_path / "said").open("w") as file, subprocess.Popen(command, stdout=file) as process:
+        try:
+            transport = Go2Robot("lo", DOMAIN)
+            assert walk(transport, policy, ticks).mode == Mode.POLICY
+            transport.close()
+        finally:
+            process.kill()
+    *place, excess, watchdog = map(float, (tmp_path / "said").read_text().splitlines()[-1].split())
+    robot = SimRobot(xml, transport.joint_order, RATE)
+    assert walk(InProcess(robot), policy, ticks).mode == Mode.POLICY
+    np.testing.assert_allclose(place, robot.data.qpos[:3], atol=0.01)
+    assert place[2] > 0.2 and excess < 1e-3 and not watchdog
+
+
+def test_scripts(make_task, exported, tmp_path):
+    """Both scripts begin and end by themselves; what they are told wrongly is refused in one line."""
+    status, output, _ = run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.3", root=tmp_path)
+    assert status == 0 and "damping" in output and "99.9% within" in output
+    words = ["--interface=lo", f"--domain={(DOMAIN + 1) % 200}", "--seconds=0.3"]
+    assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
+    status, output, _ = run_here("sim_robot.py", *words, "--fault=hot=FR_hip_joint", "--fault=lost=1", root=tmp_path)
+    assert status == 0 and "damping" in output
+    for script, wrong, message in (
+        ("deploy.py", ["--interface=none0"], "unknown network interface 'none0'"),
+        ("deploy.py", ["--interface=sim", "--rate=333"], "multiple of the policy's 50 Hz"),
+        ("deploy.py", ["--interface=sim", "--command", "2", "0", "0"], "lin_vel_x of --command must be from -1 to 1"),
+        ("deploy.py", ["--interface=eth0", "--walk"], "a real one waits for its operator"),
+        ("sim_robot.py", ["--fault=lots=1"], "unknown fault 'lots'; did you mean 'lost'?"),
+        ("sim_robot.py", ["--fault=dead=FR_hip"], "did you mean 'FR_hip_joint'?"),
+        ("sim_robot.py", ["--fault=lost=many"], "takes a number, not 'many'"),
+    ):
+        given = [str(exported)] if script == "deploy.py" else []
+        assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)
+    export_random(make_task, "a1_torque", tmp_path / "a1")
+    refused = run_here("deploy.py", "a1", "--interface=lo", root=tmp_path)
+    assert_told_in_one_line(refused, "the policy is of the robot 'a1'")
