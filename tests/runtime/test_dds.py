@@ -202,6 +202,7 @@ def test_nobody_there(transport, monkeypatch):
 @pytest.mark.parametrize(
     ("interface", "domain", "said"),
     [("l0", 1, "'l0'; did you mean 'lo'"), ("lo", 233, "233"), ("lo", DOMAIN, "process")],
+    ids=["no interface", "no domain", "taken"],
 )
 def test_what_dds_cannot_use(transport, interface, domain, said):
     """An interface that does not exist, a domain too high, and one that this process is in already, are refused."""

@@ -19,7 +19,7 @@ from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.sim_robot import SimRobot
 
-RATE, DOMAIN = 500.0, 100 + os.getpid() % 100
+RATE, DOMAIN, OTHER = 500.0, 200 + os.getpid() % 16, 216 + os.getpid() % 16
 SIDE = """
 import sys, time
 from pathlib import Path
@@ -104,7 +104,7 @@ def test_scripts(make_task, exported, tmp_path):
     """Both scripts begin and end by themselves; what they are told wrongly is refused in one line."""
     status, output, _ = run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.3", root=tmp_path)
     assert status == 0 and "damping" in output and "99.9% within" in output
-    words = ["--interface=lo", f"--domain={(DOMAIN + 1) % 200}", "--seconds=0.3"]
+    words = ["--interface=lo", f"--domain={OTHER}", "--seconds=0.3"]
     assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
     status, output, _ = run_here("sim_robot.py", *words, "--fault=hot=FR_hip_joint", "--fault=lost=1", root=tmp_path)
     assert status == 0 and "damping" in output
