@@ -71,7 +71,9 @@ class Distillation(algorithms.Distillation):
     def allocate(self) -> None:
         """Load the teachers; a UserError if there are none, or one does not fit the task."""
         if not self._files:
-            raise UserError("a student needs teachers: --set distillation.teachers=RUN names the run of a trained one")
+            raise UserError(
+                "a student needs teachers: --set 'distillation.teachers=[RUN]' names the run of a trained one"
+            )
         members = [Teacher(file, self._env, self._task_name) for file in self._files]
         self.teacher = Teachers(members, self._env)
 
@@ -129,19 +131,17 @@ class Distillation(algorithms.Distillation):
         return load_cfg is None or load_cfg.get("iteration", False)
 
     def world_state_dict(self) -> dict[str, Any]:
-        """Return what student and teachers remember of the worlds; nothing before the first update."""
-        memory = self.student.get_hidden_state()
+        """Return what student and teachers remember of the worlds, between two rollouts."""
         teachers = [policy.memory for policy in self.teacher.recurrent()]
-        return {"student": memory, "teachers": teachers} if self.num_updates else {}
+        return {"student": self.student.get_hidden_state(), "teachers": teachers}
 
     def load_world_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a :meth:`world_state_dict`."""
-        if state:
-            state = tree_map(lambda value: value.to(self.device) if isinstance(value, Tensor) else value, state)
-            self.student.reset(hidden_state=state["student"])
-            self.last_hidden_states = (state["student"], None)
-            for policy, memory in zip(self.teacher.recurrent(), state["teachers"], strict=True):
-                policy.memory = memory
+        state = tree_map(lambda value: value.to(self.device) if isinstance(value, Tensor) else value, state)
+        self.student.reset(hidden_state=state["student"])
+        self.last_hidden_states = (state["student"], None)
+        for policy, memory in zip(self.teacher.recurrent(), state["teachers"], strict=True):
+            policy.memory = memory
 
 
 class Teacher:

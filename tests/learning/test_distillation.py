@@ -42,6 +42,9 @@ class Wise(nn.Module):
     def get_hidden_state(self):
         pass
 
+    def recurrent(self):
+        return []
+
 
 def observations():
     """Random ones, of which the student sees the first group."""
@@ -99,6 +102,20 @@ def test_gradients_go_back_in_time():
         assert numbers["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
         for parameter, gradient in zip(learned, expected, strict=True):
             torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_memory_goes_on():
+    """A student that is loaded acts as the saved one would have, also if it is saved again before it learns."""
+    torch.manual_seed(0)
+    alg, loaded, again = make_learner(), make_learner(), make_learner()
+    roll_out(alg)
+    alg.update()
+    for before, after in ((alg, loaded), (loaded, again)):
+        after.load(before.state_dict(), None, True)
+        after.load_world_state_dict(before.world_state_dict())
+    obs = observations()
+    with torch.no_grad():
+        torch.testing.assert_close(again.student(obs), alg.student(obs), rtol=0.0, atol=0.0)
 
 
 @pytest.mark.parametrize("rnn_type", ["gru", "lstm"])
