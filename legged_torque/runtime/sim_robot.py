@@ -8,12 +8,13 @@ import mujoco
 import numpy as np
 
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import loading
 
 WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
 STEP = 1e-3  # of the physics, at which the drives close their loops [s]
-TOLERANCE = 1e-6  # of torques beyond limits [N m]
+FOLDED = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}  # angles of a robot that lies on its belly [rad]
 
 
 @dataclass
@@ -46,7 +47,12 @@ class SimRobot:
     """
 
     def __init__(self, xml: Path, joint_order: list[str], rate: float, seed: int = 0) -> None:
-        """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second."""
+        """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second.
+
+        A UserError if the file is unreadable, or the robot has other joints than hips, thighs and calves.
+        """
+        if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
+            raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
         with loading(xml):
             spec = mujoco.MjSpec.from_file(str(xml))
             floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], name="runtime floor")
@@ -72,8 +78,7 @@ class SimRobot:
         """Lay the robot on its belly, with folded legs."""
         mujoco.mj_resetData(self.model, self.data)
         low, high = self.model.jnt_range[[self.model.joint(name).id for name in self.joint_order]].T
-        folded = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}
-        pose = [next(angle for part, angle in folded.items() if part in name) for name in self.joint_order]
+        pose = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
         self.data.qpos[self._qpos], self.data.qpos[2] = np.clip(pose, low, high), 0.15
         mujoco.mj_forward(self.model, self.data)
 

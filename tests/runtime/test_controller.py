@@ -125,6 +125,8 @@ def test_the_wrong_robot(policy):
     with pytest.raises(UserError, match="observes felt"):
         Controller(policy, order, RATE)
     policy.supplied = []
+    with pytest.raises(UserError, match="no 'left_knee_joint'"):
+        SimRobot(resource_path("resources/robots/g1/g1.xml"), ["left_hip_yaw_joint", "left_knee_joint"], RATE)
 
 
 def turned(world):
