@@ -65,16 +65,18 @@ def main() -> None:
     session, operator = Session(controller, transport), Operator(controller, walks=args.walk)
     operator.command(args.command)
     end = time.monotonic() + (args.seconds or float("inf"))
-    with StopRequest(lambda text: None) as stop, RealTimeLoop(args.rate, session.tick) as loop, operator:
-        next_line = time.monotonic()
-        while not stop.requested and not operator.has_ended and time.monotonic() < end and loop.error is None:
-            operator.look()
-            if time.monotonic() >= next_line:
-                next_line += LINE_EVERY
-                print(session.line(loop), flush=True)
-            time.sleep(POLL)
-    session.close()
-    print(session.line(loop))
+    try:
+        with StopRequest(lambda text: None) as stop, RealTimeLoop(args.rate, session.tick) as loop, operator:
+            next_line = time.monotonic()
+            while not stop.requested and not operator.has_ended and time.monotonic() < end and loop.error is None:
+                operator.look()
+                if time.monotonic() >= next_line:
+                    next_line += LINE_EVERY
+                    print(session.line(loop), flush=True)
+                time.sleep(POLL)
+    finally:  # also where a line cannot be printed
+        session.close()
+    print("\n".join([session.line(loop), *(f"stopped: {reason}" for reason in session.stops)]))
     if loop.error is not None:
         raise loop.error
     if session.stops:

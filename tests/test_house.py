@@ -42,7 +42,7 @@ LINES = {
     "tests": 21_850,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 29_390  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 29_385  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -110,6 +110,8 @@ def export_policy(
 
 def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
     """Return why a network cannot be exported at all."""
+    if not hasattr(model, "is_recurrent"):  # which rsl_rl's models say
+        return [f"{type(model).__name__} has no is_recurrent: only rsl_rl's models and their like can be exported"]
     if getattr(model, "obs_groups_2d", []):  # of rsl_rl's CNNModel
         return [f"policies that see images cannot be exported: {', '.join(model.obs_groups_2d)}"]
     further = task.observations.groups
@@ -199,7 +201,8 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         own, keys = mj_model.joint(joint), ("damping", "armature", "frictionloss")
         passive = {key: float(getattr(own, key)[0]) for key in keys}
         joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
-        joints[joint] |= {"range": own.range.tolist(), "max_velocity": float(asset.max_dof_vel)}
+        joints[joint] |= {"max_velocity": float(asset.max_dof_vel)}
+        joints[joint] |= {"range": own.range.tolist()} if mj_model.jnt_limited[own.id] else {}
     observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
     description: dict[str, Any] = {
         "format_version": FORMAT_VERSION,

@@ -80,8 +80,8 @@ class Controller:
                 if name not in policy.joint_order
             ]
         )
-        if not all("range" in joints[name] for name in joint_order):
-            raise UserError("policy.yaml lacks the ranges of the joints: export the policy anew")
+        if not all("range" in joints[name] and joints[name]["max_velocity"] > 0.0 for name in joint_order):
+            raise UserError("policy.yaml lacks ranges of joints, or speeds (asset.max_dof_vel): export the policy anew")
         self._order = np.array([policy.joint_order.index(name) for name in joint_order])  # of the policy's vectors
         ranges = np.array([joints[name]["range"] for name in joint_order], float).T
         speeds = np.array([joints[name]["max_velocity"] for name in joint_order], float)

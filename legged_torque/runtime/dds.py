@@ -145,7 +145,7 @@ class _Side:
 class Go2Robot(_Side):
     """A robot, real or simulated, as the program sees it: a :class:`~legged_torque.runtime.interface.Transport`.
 
-    A robot's states are told apart by their ``tick`` in milliseconds: a gap of two periods is a lost message.
+    States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message.
     """
 
     def __init__(self, interface: str, domain: int) -> None:

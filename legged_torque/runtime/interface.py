@@ -1,4 +1,4 @@
-"""What a robot says and is told, whatever carries it."""
+"""The state of a robot and commands of its motors, whatever carries them."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -22,7 +22,7 @@ class RobotState:
 
 @dataclass
 class MotorCommand:
-    """What each drive is told: torque = tau + kp (q - position) + kd (dq - velocity). Shapes: (joints,)."""
+    """Targets and gains of each drive: torque = tau + kp (q - position) + kd (dq - velocity). Shapes: (joints,)."""
 
     tau: np.ndarray  # [N m]
     q: np.ndarray  # [rad]
@@ -52,10 +52,10 @@ class Transport(Protocol):
     joint_order: list[str]
 
     def receive(self) -> Received:
-        """Return what the robot has said since the last call; never waits."""
+        """Return what has come from the robot since the last call; never waits."""
 
     def send(self, command: MotorCommand) -> None:
-        """Tell the drives."""
+        """Send a command to the drives."""
 
     def close(self) -> None:
         """Leave."""

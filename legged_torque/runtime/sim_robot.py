@@ -82,14 +82,6 @@ class SimRobot:
         self.data.qpos[self._qpos], self.data.qpos[2] = np.clip(pose, low, high), 0.15
         mujoco.mj_forward(self.model, self.data)
 
-    def push(self, velocity: tuple[float, float, float]) -> None:
-        """Add a velocity to that of the trunk, in the world [m/s]."""
-        self.data.qvel[:3] += velocity
-
-    def has_fallen(self) -> bool:
-        """Return whether the trunk lies on its side or its back."""
-        return bool(self.data.xmat[1].reshape(3, 3)[2, 2] < 0.3)
-
     def step(self, received: Received) -> None:
         """Move on for the time between two messages, under the newest command."""
         period = self._steps * STEP

@@ -47,7 +47,7 @@ class CrcError(MessageError):
 
 @dataclass
 class MotorCmd_(IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
-    """What one drive is told; at first, to do nothing."""
+    """Command of one drive; at first, of no torque."""
 
     mode: uint8 = SERVO
     q: float32 = NO_POSITION
@@ -60,7 +60,7 @@ class MotorCmd_(IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
 
 @dataclass
 class BmsCmd_(IdlStruct, typename="unitree_go.msg.dds_.BmsCmd_"):
-    """What the battery is told."""
+    """Command of the battery."""
 
     off: uint8 = 0
     reserve: array[uint8, 3] = (0,) * 3
@@ -68,7 +68,7 @@ class BmsCmd_(IdlStruct, typename="unitree_go.msg.dds_.BmsCmd_"):
 
 @dataclass
 class LowCmd_(IdlStruct, typename="unitree_go.msg.dds_.LowCmd_"):
-    """What a robot is told, on the topic rt/lowcmd.
+    """Command of a robot, on the topic rt/lowcmd.
 
     Unitree's programs leave ``reserve`` 0; ours number their messages there, from 1.
     """
@@ -102,7 +102,7 @@ class IMUState_(IdlStruct, typename="unitree_go.msg.dds_.IMUState_"):
 
 @dataclass
 class MotorState_(IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
-    """What one drive says.
+    """State of one drive.
 
     Unitree names no error flags for Go2; here they are ``reserve[0]``.
     """
@@ -122,7 +122,7 @@ class MotorState_(IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
 
 @dataclass
 class BmsState_(IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
-    """What the battery says."""
+    """State of the battery."""
 
     version_high: uint8 = 0
     version_low: uint8 = 0
@@ -137,7 +137,7 @@ class BmsState_(IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
 
 @dataclass
 class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
-    """What a robot says, on the topic rt/lowstate."""
+    """State of a robot, on the topic rt/lowstate."""
 
     head: array[uint8, 2] = HEAD
     level_flag: uint8 = LOW_LEVEL

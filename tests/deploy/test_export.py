@@ -234,7 +234,7 @@ def test_observations_of_a_user(make_task, tmp_path, monkeypatch):
     assert_told_in_one_line(run_here("sim2sim.py", str(out), root=tmp_path), "plain MuJoCo has no values of felt, feet")
     note = export_note(task, model)
     assert "felt" in note and "feet" in note and "\n" not in note
-    assert "camera" in export_note(task, SimpleNamespace(obs_groups_2d=["camera"]))
+    assert "camera" in export_note(task, SimpleNamespace(is_recurrent=False, obs_groups_2d=["camera"]))
     assert not export_note(*export_random(make_task, "a1_torque", tmp_path / "plain"))
 
 
@@ -288,6 +288,7 @@ def test_networks_that_are_not_exported(make_task, tmp_path, change, message):
     model = SimpleNamespace(**{"is_recurrent": False, "obs_groups": ["policy"], **change})
     line = error_of(export_policy, make_task("a1_position", 3), model, tmp_path / "out", "a1_position", TRAINING)
     assert message in line and not list(tmp_path.iterdir())
+    assert "no is_recurrent" in export_note(make_task("a1_position", 3), SimpleNamespace(obs_groups=["policy"]))
 
 
 def test_motors_of_a_user(tmp_path):
