@@ -8,7 +8,7 @@ from torch import Tensor
 
 from legged_torque.motors.config import MotorCfg, check_encoders
 from legged_torque.motors.joints import Joints
-from legged_torque.motors.kernel import Part, newest_actions, torque_kernel
+from legged_torque.motors.kernel import Part, TorqueKernel, joint_torque, newest_actions
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.errors import UserError, unknown_name
@@ -88,16 +88,17 @@ class MotorChain:
             torques = torques if link.lost is None else torques + link.lost
         return torques
 
-    def kernel(self, law: Part) -> Part | None:
-        """Return the whole chain behind a control law as one Warp function; None if a link has none.
+    def kernel(self, law: Part | None, pos: Tensor, vel: Tensor, out: Tensor) -> TorqueKernel | None:
+        """Return the whole chain behind a control law as one kernel; None without a law, or if a link has no function.
 
-        The function is as :func:`~legged_torque.motors.kernel.torque_kernel` returns it.
+        Joint positions [rad], velocities [rad/s], and where it writes torques [N m]. Shapes: (num_envs, num_dof).
         """
-        if len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
+        if not law or len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
             return None
         parts = {link: (link.kernel, link.kernel_reads()) for link in self.links.values()}
         actions: Any = parts[self._of_actions[0]] if self._of_actions else (newest_actions, self._actions)
-        return torque_kernel(law, self.strength, actions, [(link.acts_on, parts[link]) for link in self._behind_law])
+        links = [(link.acts_on, parts[link]) for link in self._behind_law]
+        return TorqueKernel(joint_torque(law, self.strength, actions, links), pos, vel, out)
 
     def reset(self, mask: Tensor) -> None:
         """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""

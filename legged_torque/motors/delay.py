@@ -2,13 +2,13 @@
 
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from legged_torque.motors.config import DelayCfg
 from legged_torque.motors.joints import Joints
-from legged_torque.motors.kernel import read
 from legged_torque.motors.motor import Motor
-from legged_torque.sim.packets import PacketQueue, Queue, received_packet
+from legged_torque.sim.packets import PacketQueue, received_packet
 from legged_torque.sim.randomization import RandomParameter
 
 
@@ -30,6 +30,7 @@ class ActionDelay(Motor):
         super().__init__(cfg, joints)
         times, jitter, unit_steps = cfg.counted("motors.delay", joints.dt, joints.decimation)
         self.queue = PacketQueue(joints.actions, joints.decimation, times, unit_steps, jitter, cfg.loss)
+        self._received = torch.zeros_like(joints.actions)
 
     def send(self, actions: Tensor) -> None:
         """Send the actions of this control step."""
@@ -38,13 +39,12 @@ class ActionDelay(Motor):
 
     def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
         """Return the actions that have reached the motors. Shape: (num_envs, num_actions)."""
-        return self.queue.received(substep)
+        self.queue.receive(substep, self._received)
+        return self._received
 
     def kernel_reads(self) -> Any:
         """Return the queue."""
-        queue: Any = self.queue
-        names = ("newest", "before", "drawn", "extra", "unit_steps", "interval", "depth")
-        return read(Queue, **{name: getattr(queue, name) for name in names})
+        return self.queue.reads()
 
     def reset(self, mask: Tensor) -> None:
         """Forget the actions of ended episodes."""

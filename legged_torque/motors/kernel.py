@@ -37,8 +37,8 @@ def control_law(terms: Sequence[tuple[Part, Tensor | None]], num_dof: int) -> Pa
     return total
 
 
-def torque_kernel(law: Part, strength: Tensor, actions: Part, links: Sequence[tuple[str, Part]]) -> Part:
-    """Return the torque of a joint as ``Engine.drive`` takes it, ``(reads, world, joint, substep, pos, vel)`` [N m].
+def joint_torque(law: Part, strength: Tensor, actions: Part, links: Sequence[tuple[str, Part]]) -> Part:
+    """Return the torque of a joint in a physics step, ``(reads, world, joint, substep, pos, vel) -> torque [N m]``.
 
     Args:
         law: As of :func:`control_law`.
@@ -52,6 +52,26 @@ def torque_kernel(law: Part, strength: Tensor, actions: Part, links: Sequence[tu
         function, struct = (_through if acts_on == "measurements" else _behind)(function, link)
         reads = read(struct, before=reads, link=link_reads)
     return function, reads
+
+
+class TorqueKernel:
+    """The torques of all joints as one kernel, which runs before each physics step."""
+
+    def __init__(self, torque: Part, pos: Tensor, vel: Tensor, out: Tensor) -> None:
+        """Take a function as of :func:`joint_torque`, the tensors that it reads, and where it writes torques [N m].
+
+        Joint positions [rad] and velocities [rad/s]. Shapes: (num_envs, num_dof).
+        """
+        self._torque, self._arrays = torque, [wp.from_torch(tensor) for tensor in (pos, vel, out)]
+        self._launches: dict[int, wp.Launch] = {}
+
+    def launch(self, substep: int) -> None:
+        """Write the torques of a physics step, by its number in the control step."""
+        if substep not in self._launches:
+            (function, reads), (*state, out) = self._torque, self._arrays
+            inputs, where = [reads, substep, *state, out], {"device": out.device, "record_cmd": True}
+            self._launches[substep] = wp.launch(_torque_kernel(function), out.shape, inputs, **where)
+        self._launches[substep].launch()
 
 
 @wp.func
@@ -157,3 +177,24 @@ def _law_kernel(law: wp.Function) -> wp.Kernel:
         torques[world, joint] = law(reads, actions[world], world, joint, pos[world, joint], vel[world, joint])
 
     return evaluate_law
+
+
+@functools.cache
+def _torque_kernel(torque: wp.Function) -> wp.Kernel:
+    """Return the kernel that evaluates a function as of :func:`joint_torque` for all joints."""
+    Reads = struct_of(torque)
+
+    @wp.kernel(module="unique", enable_backward=False, module_options={"fast_math": True})
+    def evaluate_torques(
+        # In:
+        reads: Reads,
+        substep: int,
+        pos: wp.array2d(dtype=wp.float32),
+        vel: wp.array2d(dtype=wp.float32),
+        # Out:
+        torques: wp.array2d(dtype=wp.float32),
+    ):
+        world, joint = wp.tid()
+        torques[world, joint] = torque(reads, world, joint, substep, pos[world, joint], vel[world, joint])
+
+    return evaluate_torques

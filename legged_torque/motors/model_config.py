@@ -213,7 +213,7 @@ class MotorsCfg(Section):
     thermal = ThermalCfg  # less torque after a long load
     quantize = QuantizeCfg  # steps of torques
     encoder = EncoderCfg  # steps of measurements, for policy, control law and the links before it
-    network = NetworkCfg  # a network from logged data, outside of the physics kernel
+    network = NetworkCfg  # a network from logged data, in torch
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""

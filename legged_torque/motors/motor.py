@@ -14,8 +14,8 @@ class Motor(Buffers):
     """One link of the chain from the policy to the joints: a model of a motor, a delay, a limit.
 
     A model is a subclass with :meth:`apply`, and a section of settings whose ``build`` makes it, named in
-    ``motors.chain``. It may name a Warp function, :attr:`kernel`; if all links do, torques are computed inside the
-    physics kernel. What it keeps from step to step is made by :meth:`~legged_torque.utils.buffers.Buffers.buffer`, and
+    ``motors.chain``. It may name a Warp function, :attr:`kernel`; if all links do, one kernel computes the torques of a
+    physics step. What it keeps from step to step is made by :meth:`~legged_torque.utils.buffers.Buffers.buffer`, and
     then part of checkpoints.
     """
 
@@ -25,7 +25,7 @@ class Motor(Buffers):
     The last is for a single link with a method ``measured``, see :class:`~legged_torque.motors.models.EncoderModel`.
     """
     kernel: ClassVar[Any] = None
-    """A Warp function that does the same as :meth:`apply` for one joint of one world, inside the physics kernel.
+    """A Warp function that does the same as :meth:`apply` for one joint of one world.
 
     Of torques: ``(reads, world, joint, substep, wanted, pos, vel) -> torque [N m]``, where ``reads`` is the struct that
     :meth:`kernel_reads` returns. Of actions: ``(reads, world, substep) -> row of actions``. Of measurements: ``(reads,

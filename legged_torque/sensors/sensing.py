@@ -23,7 +23,8 @@ class Sensing:
 
     def __init__(self, cfg: LatencyCfg, state: RobotState, motors: MotorChain, dt: float, decimation: int) -> None:
         """Allocate room for the longest delay; a UserError if it is not a whole number of physics steps."""
-        self._state, self._motors, num_dof = state, motors, state.dof_pos.shape[1]
+        self._motors, num_dof = motors, state.dof_pos.shape[1]
+        self._orientation_and_joints, self._velocities = state.qpos[:, 3:], state.qvel[:, 3:]
         self._measured = 0
         times, jitter, unit_steps = cfg.counted("sensing.delay", dt, decimation)
         self.queue = PacketQueue(self._packet(), 1, times, unit_steps, jitter, cfg.loss)
@@ -32,27 +33,33 @@ class Sensing:
         self._quat, self.dof_pos, self.base_ang_vel, self.dof_vel = parts
         self._gravity = torch.tensor([[0.0, 0.0, -1.0]], device=state.device)
 
-    def begin(self) -> None:
+    def begin_step(self) -> None:
         """Begin a control step: draw what happens to its measurements."""
         self._measured = 0
         self.queue.draw()
 
     def measure(self) -> None:
         """Measure at the end of a physics step."""
-        self.queue.send(self._packet(), self._measured)
+        self.queue.send(self._orientation_and_joints, self._velocities, self._measured)
         self._measured += 1
 
-    def update(self, is_new: Tensor) -> None:
-        """Look at the end of a control step.
+    def begin_episodes(self, is_new: Tensor) -> None:
+        """Let the present have arrived where an episode has just started, as ``is_new`` says.
 
-        Where an episode has just started, as ``is_new`` says, the present has arrived. Shape: (num_envs,), bool.
+        Shape: (num_envs,), bool.
         """
         self.queue.restart(is_new, self._packet())
-        self.look()
 
     def look(self) -> None:
-        """Write what has arrived."""
-        self._arrived.copy_(self.queue.received() if self.queue.is_needed else self._packet())
+        """Write what has arrived, as the joint encoders give it."""
+        if self.queue.is_needed:
+            self.queue.receive(0, self._arrived)
+        else:
+            self._arrived.copy_(self._packet())
+        if self._motors.encoder:
+            pos, vel = self._motors.measured(self.dof_pos, self.dof_vel)
+            self.dof_pos.copy_(pos)
+            self.dof_vel.copy_(vel)
 
     @property
     def projected_gravity(self) -> Tensor:
@@ -60,7 +67,5 @@ class Sensing:
         return quat_rotate_inverse(self._quat, self._gravity)
 
     def _packet(self) -> Tensor:
-        """Return a measurement of this moment. Shape: (num_envs, 7 + 2 num_dof)."""
-        state = self._state
-        pos, vel = self._motors.measured(state.dof_pos, state.dof_vel)
-        return torch.cat([state.base_quat, pos, state.base_ang_vel, vel], dim=1)
+        """Return a measurement of this moment, before the encoders. Shape: (num_envs, 7 + 2 num_dof)."""
+        return torch.cat([self._orientation_and_joints, self._velocities], dim=1)

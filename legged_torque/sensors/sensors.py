@@ -37,24 +37,30 @@ class Sensors(dict[str, Sensor]):
             self["height_scan"] = self.height_scan
         for sensor in self.values():
             sensor.has_noise = cfg.noise.add_noise
-        self.has_kernels = not all(sensor.compilable for sensor in self.values())
         sensing = Sensing(cfg.sensing.delay, state, motors, cfg.sim.dt, cfg.control.decimation)
         self.sensing = sensing if sensing.queue.is_needed or motors.encoder else None
+        self._is_late = bool(self.sensing) and sensing.queue.is_needed
+        self.has_kernels = self._is_late or not all(sensor.compilable for sensor in self.values())
 
     def begin_step(self) -> list[Callable[[], None]]:
         """Begin a control step; return what to call after each physics step, if sensors measure then."""
-        if not self.sensing or not self.sensing.queue.is_needed:
+        if not self.sensing or not self._is_late:
             return []
-        self.sensing.begin()
+        self.sensing.begin_step()
         return [self.sensing.measure]
+
+    def begin_episodes(self, is_new: Tensor) -> None:
+        """Forget what was measured before the episodes that have just started. Shape: (num_envs,), bool."""
+        if self.sensing:
+            self.sensing.begin_episodes(is_new)
 
     def update_all(self, is_new: Tensor, compilable: bool) -> None:
         """Let those sensors measure that are ``compilable``, or those that are not; see :meth:`Sensor.update`."""
         for sensor in self.values():
             if sensor.compilable == compilable:
                 sensor.update(is_new)
-        if self.sensing and compilable:
-            self.sensing.update(is_new)
+        if self.sensing and compilable != self._is_late:
+            self.sensing.look()
 
     @contextlib.contextmanager
     def looking_ahead(self) -> Iterator[None]:

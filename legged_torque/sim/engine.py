@@ -1,12 +1,11 @@
 """The interface of physics engines."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol
 
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
@@ -14,7 +13,6 @@ from legged_torque.utils.errors import UserError
 CAPABILITIES = {
     "height_map": "takes ground that is not a plane as a HeightMap, not as a hfield in its model",
     "self_collision": "lets parts of a robot collide with each other",
-    "torques_in_kernel": "has Engine.drive, which computes torques inside the physics kernel",
     "applied_forces": "has Engine.applied_forces",
     "per_world": "has Engine.field and what belongs to it: parameters of the model that differ from world to world",
 }
@@ -130,18 +128,6 @@ class Engine(Protocol):
             raise UserError(f"the state of the worlds does not fit the engine: {', '.join(names)}")
         for name, tensor in own.items():
             tensor.copy_(state[name])
-
-    # ---- "torques_in_kernel" -----------------------------------------------------------------------------------------
-
-    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Sequence[Callable[[], None]] = ()) -> None:
-        """Advance every world by some physics steps, each under torques of its own; the last one senses.
-
-        Before each of them, ``law(reads, world, motor, step, position, velocity)`` gives the torque of a motor [N m],
-        which is written to ``ctrl``; ``step`` counts from 0, position [rad] and velocity [rad/s] are its joint's.
-        ``reads`` is an instance of the Warp struct that is the type of the law's first argument. After each physics
-        step, all of ``after_step`` are called to look at the state.
-        """
-        raise lacks(self, "torques_in_kernel")
 
     # ---- "applied_forces" --------------------------------------------------------------------------------------------
 

@@ -8,10 +8,48 @@ from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.buffers import Buffers
 
 
+@wp.struct
+class Queue:
+    """What :func:`received_packet` reads, see :class:`PacketQueue`."""
+
+    newest: wp.array2d[float]
+    before: wp.array3d[float]
+    drawn: wp.array2d[float]
+    extra: wp.array2d[float]
+    unit_steps: int
+    interval: int
+    depth: int
+
+
+@wp.func
+def received_packet(queue: Queue, world: int, elapsed: int) -> wp.array[float]:
+    """Return the packet that a world's receiver has ``elapsed`` physics steps after the newest was sent."""
+    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e6)) * queue.unit_steps - elapsed
+    age = int(wp.clamp((missing + queue.interval - 1) // queue.interval, 0, queue.depth))
+    for packet in range(age, queue.extra.shape[1] - 1):  # type: ignore[attr-defined]
+        if packet == age and float(missing - packet * queue.interval) + queue.extra[world, packet] > 0.0:
+            age = packet + 1
+    return wp.where(age > 0, queue.before[world, wp.max(age, 1) - 1], queue.newest[world])
+
+
+@wp.kernel(enable_backward=False)
+def receive_packet(
+    # In:
+    queue: Queue,
+    elapsed: int,
+    # Out:
+    received: wp.array2d[float],
+):
+    """Write one number of the packet that a world's receiver has."""
+    world, column = wp.tid()  # type: ignore[misc]
+    received[world, column] = received_packet(queue, world, elapsed)[column]
+
+
 @wp.kernel(enable_backward=False)
 def send_packet(
     # In:
     packet: wp.array2d[float],
+    rest: wp.array2d[float],
     seeds: wp.array[int],
     stream: int,
     loss: float,
@@ -23,7 +61,7 @@ def send_packet(
     before: wp.array3d[float],
     extra: wp.array2d[float],
 ):
-    """Queue one number of a world's packet; arguments as of :class:`PacketQueue`.
+    """Queue one number of a world's packet, which is in one array or two; arguments as of :class:`PacketQueue`.
 
     In place of a lost packet, the one before is queued once more, to arrive when that one does.
     """
@@ -39,7 +77,11 @@ def send_packet(
     if oldest >= 0:
         before[world, 0, column] = newest[world, column]
     if not is_lost:
-        newest[world, column] = packet[world, column]
+        split = packet.shape[1]  # type: ignore[attr-defined]
+        if column < split:
+            newest[world, column] = packet[world, column]
+        else:
+            newest[world, column] = rest[world, column - split]
     if column == 0 and extra.shape[1] > 1:  # type: ignore[attr-defined]
         last = extra[world, 0]
         for i in range(oldest + 1):
@@ -83,7 +125,6 @@ class PacketQueue(Buffers):
         self.newest = self.buffer("newest", width) if self.is_needed else like
         self.before, self.drawn = self.buffer("before", self.depth, width), self.buffer("drawn", 1)
         self.extra = self.buffer("extra", self.depth + 1) if jitter else torch.zeros_like(self.drawn)
-        self._ages = torch.arange(self.depth + 1, device=like.device)
         seeds = self.num_envs if jitter or loss else 0
         self.seeds = torch.zeros(seeds, dtype=torch.int32, device=like.device)
 
@@ -92,22 +133,26 @@ class PacketQueue(Buffers):
         if len(self.seeds):
             self.seeds.random_()
 
-    def send(self, packet: Tensor, stream: int = 0) -> None:
-        """Send a packet. Shape: (num_envs, width)."""
+    def send(self, packet: Tensor, rest: Tensor | None = None, stream: int = 0) -> None:
+        """Send a packet, whose last numbers may be in a second tensor. Shape of both together: (num_envs, width)."""
         if self.is_needed:
             chances = (stream, self.loss, self.jitter, self.unit_steps, self.interval)
-            arrays = (packet, self.seeds, self.newest, self.before, self.extra)
-            sent, seeds, *queue = (wp.from_torch(array) for array in arrays)
-            wp.launch(send_packet, tuple(packet.shape), [sent, seeds, *chances, *queue], device=sent.device)
+            arrays = (packet, packet[:, :0] if rest is None else rest, self.seeds, self.newest, self.before, self.extra)
+            sent, other, seeds, *queue = (wp.from_torch(array) for array in arrays)
+            wp.launch(send_packet, queue[0].shape, [sent, other, seeds, *chances, *queue], device=sent.device)
 
-    def received(self, elapsed: int = 0) -> Tensor:
-        """Return the packet that the receiver has some physics steps after the newest was sent. Shape: as of it."""
-        if not self.depth:
-            return self.newest
-        arrival = self.drawn.floor() * self.unit_steps + self.extra - self.interval * self._ages
-        age = torch.where(arrival > elapsed, self.depth, self._ages).amin(dim=1)  # NaN has arrived
-        history = torch.cat([self.newest.unsqueeze(1), self.before], dim=1)
-        return history.gather(1, age.view(-1, 1, 1).expand(-1, 1, history.shape[2])).squeeze(1)
+    def receive(self, elapsed: int, out: Tensor) -> None:
+        """Write the packet that the receiver has some physics steps after the newest was sent. Shape: as of it."""
+        received = wp.from_torch(out)
+        wp.launch(receive_packet, received.shape, [self.reads(), elapsed, received], device=received.device)
+
+    def reads(self) -> Queue:
+        """Return the inputs of :func:`received_packet`."""
+        queue = Queue()
+        for name in Queue.vars:  # type: ignore[attr-defined]
+            value = getattr(self, name)
+            setattr(queue, name, wp.from_torch(value) if isinstance(value, Tensor) else value)
+        return queue
 
     def restart(self, mask: Tensor, packet: Tensor) -> None:
         """Let the receiver have a packet, in the worlds of a mask, and none of those before.
@@ -125,27 +170,3 @@ class PacketQueue(Buffers):
         shortest, longest = self.times
         drawn, limits = {"set": [float(shortest), longest + 1.0]}, ([float(shortest)], [longest + 0.5])
         return RandomParameter(name, self.drawn, [0], drawn, limits=limits, at_reset_only=True)
-
-
-@wp.struct
-class Queue:
-    """Inputs of :func:`received_packet`, see :class:`PacketQueue`."""
-
-    newest: wp.array2d[float]
-    before: wp.array3d[float]
-    drawn: wp.array2d[float]
-    extra: wp.array2d[float]
-    unit_steps: int
-    interval: int
-    depth: int
-
-
-@wp.func
-def received_packet(queue: Queue, world: int, elapsed: int) -> wp.array[float]:
-    """Return what :meth:`PacketQueue.received` does, for one world."""
-    missing = int(wp.clamp(queue.drawn[world, 0], 0.0, 1.0e6)) * queue.unit_steps - elapsed
-    age = int(wp.clamp((missing + queue.interval - 1) // queue.interval, 0, queue.depth))
-    for packet in range(age, queue.extra.shape[1] - 1):  # type: ignore[attr-defined]
-        if packet == age and float(missing - packet * queue.interval) + queue.extra[world, packet] > 0.0:
-            age = packet + 1
-    return wp.where(age > 0, queue.before[world, wp.max(age, 1) - 1], queue.newest[world])

@@ -11,6 +11,7 @@ from support.episodes import HIGH_UP, time_out
 from support.settings import error_of
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.legged_robot import IN_TORCH
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.options import Options
@@ -80,7 +81,7 @@ def test_as_the_module(make_task, tmp_path, activation):
         if name not in ("stiffness", "damping")
     ]
     task = make_task("a1_position", 5, **options, **CHAIN, **{"domain_rand.keep_fixed": fixed})
-    assert task.p_gains.std() > 0.1 and any("outside of the physics kernel" in note for note in task.notes)
+    assert task.p_gains.std() > 0.1 and any(IN_TORCH in note for note in task.notes)
     names = task.dof_names
     description = {"joint_order": names, "motors": parse_yaml(json.dumps(task.motors.describe()), "policy.yaml")}
     description |= {"timing": {"decimation": 1, "physics_frequency": 200.0}}

@@ -8,6 +8,7 @@ from support.episodes import HIGH_UP, time_out
 from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.base.legged_robot import IN_TORCH
 from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.motors.config import MotorCfg
 from legged_torque.motors.kernel import read
@@ -181,13 +182,8 @@ def test_curve_and_rate(in_torch):
     if in_torch:
         torques_in_torch(task)
     last, noted = np.zeros((3, 12)), []
-    sim_step, drive = task.sim.step, task.sim.drive
-
-    def note():
-        noted.append(task.dof_vel.numpy().copy())
-
-    task.sim.step = lambda sense: (note(), sim_step(sense))
-    task.sim.drive = lambda steps, *law: [(note(), drive(1, *law)) for _ in range(steps)]
+    sim_step = task.sim.step
+    task.sim.step = lambda sense: (noted.append(task.dof_vel.numpy().copy()), sim_step(sense))
     generator = torch.Generator().manual_seed(0)
     for step in range(5):
         if step == 3:
@@ -204,9 +200,9 @@ def test_curve_and_rate(in_torch):
 
 
 def test_a_link_without_a_kernel():
-    """Torques then leave the kernel, with a note; a delay behind other links, and two links of one model."""
+    """Torch then computes all torques, with a note; a delay behind other links, and two links of one model."""
     task = make(2, ("curve", "quick", "late"), randomize_parameters=False)
-    assert any("outside of the physics kernel" in note for note in task.notes)
+    assert any(IN_TORCH in note for note in task.notes)
     seen = []
     run = task.sim.step
     task.sim.step = lambda sense: (seen.append(task.torques.numpy().copy()), run(sense))

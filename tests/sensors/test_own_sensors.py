@@ -225,8 +225,8 @@ def test_physics_steps(make_task, in_torch, delay, decimation):
     task.commands.zero_()
     task.command_generator.values.zero_()
     now = lambda: (task.sim.qpos.numpy().copy(), task.sim.qvel.numpy().copy())  # noqa: E731
-    history, launch = [now()], task.sim._launch
-    task.sim._launch = lambda *args: (launch(*args), history.append(now()))
+    history, move = [now()], task.sim.step
+    task.sim.step = lambda sense: (move(sense), history.append(now()))
     start = np.zeros(3, int)
     for step in range(6):
         if step == 3:
@@ -255,7 +255,7 @@ def test_jitter_and_loss(make_task):
     queue, clock = task.sensors.sensing.queue, torch.zeros(500)
     assert sorted(set(queue.drawn.floor()[:, 0].tolist())) == [0.0, 1.0, 2.0, 3.0]
     send, seen = queue.send, []
-    queue.send = lambda packet, stream: send(torch.full_like(packet, len(seen) + 1.0), stream)
+    queue.send = lambda *parts: send(*(torch.full_like(part, len(seen) + 1.0) for part in parts[:2]), parts[2])
     for step in range(1, 40):
         task.step(torch.zeros(500, 12))
         arrived = task.sensors.sensing.dof_vel[:, 0].clone()

@@ -1,22 +1,15 @@
-"""Packets that are late, jitter and get lost: as a queue in numpy, in torch and in a kernel."""
+"""Packets that are late, jitter and get lost: as a queue in numpy."""
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
-from legged_torque.sim.packets import PacketQueue, Queue, received_packet
+from legged_torque.sim.packets import PacketQueue
 
 WORLDS = 400
 
 wp.init()
-
-
-@wp.kernel(module="unique")
-def receive(queue: Queue, elapsed: int, out: wp.array2d(dtype=float)):
-    """Write what each world has received."""
-    world, column = wp.tid()
-    out[world, column] = received_packet(queue, world, elapsed)[column]
 
 
 @wp.kernel(module="unique")
@@ -29,14 +22,10 @@ def fate(seeds: wp.array(dtype=int), loss: float, jitter: int, lost: wp.array(dt
     late[world] = wp.randi(state, 0, jitter + 1)
 
 
-def in_kernel(queue, elapsed):
-    """What the kernel says has been received."""
-    reads, out = Queue(), wp.zeros(tuple(queue.newest.shape), dtype=float)
-    for name in ("newest", "before", "drawn", "extra"):
-        setattr(reads, name, wp.from_torch(getattr(queue, name)))
-    for name in ("unit_steps", "interval", "depth"):
-        setattr(reads, name, getattr(queue, name))
-    wp.launch(receive, out.shape, [reads, elapsed, out])
+def received(queue, elapsed=0):
+    """What each world has received."""
+    out = torch.zeros(WORLDS, 2)
+    queue.receive(elapsed, out)
     return out.numpy()
 
 
@@ -51,7 +40,7 @@ def in_kernel(queue, elapsed):
     ],
 )
 def test_queue(interval, times, unit, jitter, loss):
-    """At each physics step: the newest packet that has arrived by then, or the start's; torch and kernel alike."""
+    """At each physics step: the newest packet that has arrived by then, or the start's."""
     torch.manual_seed(0)
     queue = PacketQueue(torch.zeros(WORLDS, 2), interval, times, unit, jitter, loss)
     delays = np.random.default_rng(0).integers(times[0], times[1] + 1, WORLDS)
@@ -61,7 +50,7 @@ def test_queue(interval, times, unit, jitter, loss):
     for number in range(30):
         queue.draw()
         packet = np.random.default_rng(number).normal(size=(WORLDS, 2)).astype(np.float32)
-        queue.send(torch.tensor(packet))
+        queue.send(torch.tensor(packet[:, :1]), torch.tensor(packet[:, 1:]))
         lost, late = wp.zeros(WORLDS, dtype=int), wp.zeros(WORLDS, dtype=int)
         if jitter or loss:
             wp.launch(fate, WORLDS, [wp.from_torch(queue.seeds), loss, jitter, lost, late])
@@ -75,9 +64,8 @@ def test_queue(interval, times, unit, jitter, loss):
                 overtaken += (arrives & (i < newest)).sum()
                 held[arrives & (i > newest)] = values[arrives & (i > newest)]
                 newest[arrives & (i > newest)] = i
-            assert np.array_equal(queue.received(elapsed), held.astype(np.float32))
-            assert np.array_equal(in_kernel(queue, elapsed), held.astype(np.float32))
+            assert np.array_equal(received(queue, elapsed), held.astype(np.float32))
     assert abs(np.mean(all_lost) - loss) < 0.02 and (overtaken > 100) == (jitter * unit > interval)
     assert np.ptp(np.bincount(np.ravel(all_late), minlength=jitter + 1)) < 0.1 * 30 * WORLDS
     queue.restart(torch.arange(WORLDS) < 5, torch.full((WORLDS, 2), 7.0))
-    assert (queue.received()[:5] == 7.0).all() and not (queue.received()[5:] == 7.0).any()
+    assert (received(queue)[:5] == 7.0).all() and not (received(queue)[5:] == 7.0).any()

@@ -16,7 +16,6 @@ LEG_UP = (0.0, 2.6, -0.95)
 """Angles of a leg that points up, away from the floor."""
 STATE = ("qpos", "qvel", "ctrl", "contact_found", "contact_force")
 USES = {
-    "torques_in_kernel": lambda sim: sim.drive(1, None, None),
     "applied_forces": lambda sim: sim.applied_forces(),
     "per_world": lambda sim: sim.field("body_mass"),
     "height_map": lambda sim: make_engine(sim.name, sim.mj_model, 1, height_map=object()),

@@ -44,7 +44,7 @@ from legged_torque.terrain import make_terrain
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError
 
-OUTSIDE_KERNEL = "torques are computed in torch, outside of the physics kernel: training on an H100 is up to 6% slower"
+IN_TORCH = "torques are computed in torch, not in one kernel: training on an H100 is up to 6% slower"
 """Note of tasks that override ``_compute_torques`` or have motors without a Warp function."""
 
 
@@ -127,8 +127,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         """Return the torques that motors are asked for [N m], at every physics step: those of :meth:`action_terms`.
 
-        Override it to compute them in torch; the physics kernel does not compute them then. Joint encoders tell
-        ``motors.measured``. Shapes: (num_envs, num_actions) to (num_envs, num_dof).
+        Override it to compute them in torch; no kernel does it then. ``motors.measured`` returns what joint encoders
+        measure. Shapes: (num_envs, num_actions) to (num_envs, num_dof).
         """
         measured = self.motors.measured(self.dof_pos, self.dof_vel)
         return self.control_law.torques(actions, *measured, out=self._wanted_torques)
@@ -168,18 +168,17 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.post_physics_step()
 
     def run_physics(self) -> None:
-        """Do the physics steps of a control step, with torques inside of them where that is possible."""
+        """Do the physics steps of a control step, with torques of one kernel where that is possible."""
         self.motors.send(self.actions)
-        decimation, refresh = self.cfg.control.decimation, self.cfg.control.refresh_torques
+        decimation, pos, vel = self.cfg.control.decimation, self.dof_pos, self.dof_vel
         after_step = self.power.begin() + self.sensors.begin_step()
-        if self._torque_kernel and not self._is_overridden():
-            self.sim.drive(decimation, *self._torque_kernel, after_step)
-            return
-        pos, vel = self.dof_pos, self.dof_vel
         for i in range(decimation):
-            if i == 0 or refresh:
-                wanted = self._compute_torques(self.motors.actions(pos, vel, i))
-            self.torques.copy_(self.motors.apply(wanted, pos, vel, i))
+            if self._torque_kernel and not self._is_overridden():
+                self._torque_kernel.launch(i)
+            else:
+                if i == 0 or self.cfg.control.refresh_torques:
+                    wanted = self._compute_torques(self.motors.actions(pos, vel, i))
+                self.torques.copy_(self.motors.apply(wanted, pos, vel, i))
             self.sim.step(sense=i == decimation - 1)
             for look in after_step:
                 look()
@@ -265,6 +264,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         for buffer in (*per_world, state.episode_length):
             buffer.masked_fill_(state.reset_buf, 0)
         self.motors.reset(state.reset_buf)
+        self.sensors.begin_episodes(state.reset_buf)
         state.update()
         self.command_generator.update(self.command_generator.is_new)
 
@@ -287,6 +287,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.sim.qvel.copy_(qvel)
         self.state.update()
         self.command_generator.update()
+        self.sensors.begin_episodes(self.state.reset_buf)
         self.sensors.update_all(self.state.reset_buf, compilable=False)
         self._observe()
 
@@ -329,8 +330,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.control_law = ControlLaw(self.action_terms(), self.num_dof)
         self.num_actions = self.control_law.num_actions
         if cfg.env.num_actions not in (None, self.num_actions):
-            name = type(self).__name__
-            raise UserError(f"env.num_actions must be {self.num_actions} for {name}, not {cfg.env.num_actions}")
+            expected = f"{self.num_actions} for {type(self).__name__}"
+            raise UserError(f"env.num_actions must be {expected}, not {cfg.env.num_actions}")
         cfg.env.num_actions = self.num_actions
         self.state = RobotState(self.sim, self.terrain, asset.feet, asset.foot_of, self.num_actions, self.dt)
         self._use_attributes_of(self.state)
@@ -343,11 +344,10 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.motor_strength = self.motors.strength
         self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
         self._torque_kernel = None
-        if "torques_in_kernel" in self.sim.capabilities and cfg.control.refresh_torques:
-            law = self.control_law.kernel
-            self._torque_kernel = self.motors.kernel(law) if law else None
+        if cfg.control.refresh_torques:
+            self._torque_kernel = self.motors.kernel(self.control_law.kernel, self.dof_pos, self.dof_vel, self.torques)
             if self._is_overridden() or not self._torque_kernel:
-                self.notes.append(f"{type(self).__name__}: {OUTSIDE_KERNEL}")
+                self.notes.append(f"{type(self).__name__}: {IN_TORCH}")
         self.sensors = Sensors(cfg, self.state, self.motors)
 
     def _prepare_reward_functions(self) -> None:

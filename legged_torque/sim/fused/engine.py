@@ -1,7 +1,6 @@
 """The engine "fused": one kernel per physics step, for legged robots."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import mujoco
 import warp as wp
@@ -30,7 +29,7 @@ class FusedEngine(WarpEngine):
     """
 
     name = "fused"
-    capabilities = frozenset({"height_map", "self_collision", "torques_in_kernel", "applied_forces", "per_world"})
+    capabilities = frozenset({"height_map", "self_collision", "applied_forces", "per_world"})
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, device: str, height_map: HeightMap | None = None) -> None:
         """Build the worlds; kernels compile at the first step that needs them.
@@ -64,24 +63,8 @@ class FusedEngine(WarpEngine):
 
     def step(self, sense: bool = True) -> None:
         """Launch one physics step."""
-        self._launch(range(1), sense, None, 0)
-
-    def drive(self, steps: int, law: wp.Function, reads: Any, after_step: Sequence[Callable[[], None]] = ()) -> None:
-        """Launch some physics steps under a control law.
-
-        On a GPU each step is a launch: within one, worlds drift apart, and threads at different places of this long
-        kernel wait for its instructions (one launch for four steps takes 1.1 to 1.6 times as long on an H200).
-        """
-        step_by_step = [range(i, i + 1) for i in range(steps)]
-        for part in step_by_step if self._wp_device.is_cuda or after_step else [range(steps)]:
-            self._launch(part, part.stop == steps, law, reads)
-            for look in after_step:
-                look()
-
-    def _launch(self, steps: range, sense: bool, law: wp.Function | None, reads: Any) -> None:
-        """Run the kernel for some steps, the last of which may sense."""
-        kernel, dim = make_kernel(self._layout, self._has_forces, law), (self.num_envs, self._layout.threads)
-        inputs = [self._struct, self._ground, reads, self._state, self._scratch, steps.start, steps.stop, sense]
+        kernel, dim = make_kernel(self._layout, self._has_forces), (self.num_envs, self._layout.threads)
+        inputs = [self._struct, self._ground, self._state, self._scratch, sense]
         launch_worlds(kernel, dim, inputs, self._wp_device, BLOCK_DIM)
 
     def applied_forces(self) -> tuple[Tensor, Tensor]:

@@ -3,12 +3,9 @@
 MuJoCo Warp runs a step as some hundred small kernels, which wait for each other and for memory. A legged robot on
 the ground is small: a trunk and a few branches of hinge joints that meet only there. Here a thread holds a branch in
 registers from kinematics to integration, and the threads of a world sum up the terms of the trunk.
-
-A launch may do several steps, each under torques that a Warp function computes from the state of the joints.
 """
 
 import functools
-from typing import Any
 
 import warp as wp
 
@@ -20,7 +17,7 @@ from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.integrate import integrate_branch, integrate_trunk, sense_branch, sense_self_contacts
 from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.math import sync_group
-from legged_torque.sim.fused.model import Model, State, dof, local_copy, qadr
+from legged_torque.sim.fused.model import Model, State, dof, local_copy
 from legged_torque.sim.fused.newton import newton_solver
 from legged_torque.sim.fused.smooth import (
     Pose,
@@ -34,30 +31,6 @@ from legged_torque.sim.fused.smooth import (
 from legged_torque.sim.fused.surface import Surface
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, solve_trunk, warm_start, whole_body
 from legged_torque.sim.fused.types import AnyBranch, Body, Trunk, branch_types
-
-
-@functools.cache
-def torque_writer(layout: Layout, law: wp.Function | None) -> wp.Function:
-    """Return ``write_torques`` for a control law; without one, torques are in ``ctrl`` already."""
-    depth, own = layout.depth, branches_of(layout)
-
-    @wp.func
-    def write_torques(model: Model, state: State, world: int, thread: int, step: int, reads: Any):
-        """Write the torques of the branches' motors in one step of this launch."""
-        if wp.static(law is not None):
-            for i in range(wp.static(own.per_thread)):
-                b = thread + i * wp.static(own.threads)
-                if own.owns(thread, i):
-                    for j in range(wp.static(depth)):
-                        joint = model.branch_joint[b, j]
-                        motor = model.branch_actuator[b, j]
-                        if motor >= 0:
-                            pos = state.qpos[world, qadr(joint)]
-                            vel = state.qvel[world, dof(joint)]
-                            state.ctrl[world, motor] = law(reads, world, motor, step, pos, vel)
-            sync_group(wp.static(own.threads))  # a NaN among them stops all of a world's motors
-
-    return write_torques
 
 
 @functools.cache
@@ -178,16 +151,14 @@ def integrator(layout: Layout) -> wp.Function:
 
 
 @functools.cache
-def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = None) -> wp.Kernel:
-    """Return the kernel for a robot's structure, with or without forces that a user applies, and a law for torques."""
-    write_torques = torque_writer(layout, law)
+def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
+    """Return the kernel for a robot's structure, with or without forces that a user applies."""
     make_branches = branches_maker(layout, applied_forces)
     make_self_constraints = self_constraint_maker(layout)
     solve = newton_solver(layout)
     integrate = integrator(layout)
     own = branches_of(layout)
     Ground, place_ground = (Surface, place_map) if layout.on_map else (wp.int32, place_plane)
-    Reads = next(iter(law.input_types.values())) if law else wp.int32  # the law's first argument
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
@@ -195,32 +166,25 @@ def make_kernel(layout: Layout, applied_forces: bool, law: wp.Function | None = 
         # Model:
         model: Model,
         ground: Ground,
-        reads: Reads,
         # Data, in and out:
         data: State,
         scratch: own.Scratch,
-        # Steps of this launch:
-        first_step: int,
-        end_step: int,
         sense: bool,
     ):
         place, thread = wp.tid()
         world = first_world + place
         state = local_copy(data)
         scratch.contacts = place_ground(model, ground, world, scratch.contacts)
-        for step in range(first_step, end_step):
-            trunk = make_trunk(model, state, world)
-            if wp.static(applied_forces):
-                trunk = apply_to_trunk(model, state, world, trunk)
-            acc = warm_start(state, world)
-            write_torques(model, state, world, thread, step, reads)
-            branch, total = make_branches(model, state, scratch, world, thread, trunk, acc)
-            scratch = make_self_constraints(model, scratch, world, thread, branch)
-            whole = whole_body(trunk, total, wp.static(own.threads))
-            branch, acc, used = solve(model, scratch, world, thread, whole, branch, trunk.rot, acc)
-            is_last = step == end_step - 1
-            integrate(model, state, scratch, world, thread, branch, whole, trunk, acc, sense and is_last)
-            if thread == 0:
-                state.solver_niter[world] = used
+        trunk = make_trunk(model, state, world)
+        if wp.static(applied_forces):
+            trunk = apply_to_trunk(model, state, world, trunk)
+        acc = warm_start(state, world)
+        branch, total = make_branches(model, state, scratch, world, thread, trunk, acc)
+        scratch = make_self_constraints(model, scratch, world, thread, branch)
+        whole = whole_body(trunk, total, wp.static(own.threads))
+        branch, acc, used = solve(model, scratch, world, thread, whole, branch, trunk.rot, acc)
+        integrate(model, state, scratch, world, thread, branch, whole, trunk, acc, sense)
+        if thread == 0:
+            state.solver_niter[world] = used
 
     return fused_step
