@@ -17,9 +17,11 @@ from legged_torque.utils.processes import ending_with_parent
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from legged_torque.utils.shared_mean import SharedMean
 
 MAX_PROCESSES = 8  # that this module starts: each holds 0.7 GB of memory
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
+_shared: SharedMean | None = None  # of processes that this module has started, once they have found each other
 
 
 def world_size() -> int:
@@ -67,6 +69,9 @@ def use_cores(num_processes: int) -> bool:
     torch.set_flush_denormal(True)
     if world_size() > 1:
         return False
+    from legged_torque.utils.shared_mean import listen
+
+    listen()
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
@@ -91,10 +96,14 @@ def join(device: str) -> None:
     """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N")."""
     import torch
 
+    global _shared
     if torch.distributed.is_initialized():
         return
     try:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
+        from legged_torque.utils.shared_mean import SharedMean, can_share
+
+        _shared = SharedMean(rank(), world_size()) if can_share() else None
     except ValueError as error:  # an environment variable that torchrun sets is missing
         raise UserError(f"WORLD_SIZE is {world_size()}, but torchrun has not started this process: {error}") from None
     except torch.distributed.DistError as error:
@@ -107,27 +116,13 @@ def average(tensors: list[Tensor]) -> None:
     import torch
 
     flat = torch.cat([tensor.flatten() for tensor in tensors])
-    if flat.is_cuda:
-        torch.distributed.all_reduce(flat)
+    if _shared:
+        flat = _shared.average(flat)
     else:
-        _sum_on_cpu(flat)
-    flat /= torch.distributed.get_world_size()
+        torch.distributed.all_reduce(flat)
+        flat /= torch.distributed.get_world_size()
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
         tensor.copy_(mean.view_as(tensor))
-
-
-def _sum_on_cpu(values: Tensor) -> None:
-    """Replace a tensor by its sum over all processes; gloo's all_reduce takes longer for two of them."""
-    import torch
-
-    if rank() > 0:
-        torch.distributed.send(values, 0)
-    else:
-        other = torch.empty_like(values)
-        for number in range(1, torch.distributed.get_world_size()):
-            torch.distributed.recv(other, number)
-            values += other
-    torch.distributed.broadcast(values, 0)
 
 
 def any_process(condition: bool, device: str) -> bool:

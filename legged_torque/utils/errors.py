@@ -66,9 +66,13 @@ def collect_errors(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
+class LostProcessError(RuntimeError):
+    """A process has ended with which this one trains."""
+
+
 def has_lost_process(error: Exception) -> bool:
     """Return whether an error says that a process has ended with which this one exchanges tensors on a CPU."""
-    return isinstance(error, RuntimeError) and "gloo" in str(error)
+    return isinstance(error, LostProcessError) or (isinstance(error, RuntimeError) and "gloo" in str(error))
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
