@@ -15,10 +15,10 @@ def standard_presets() -> dict[str, dict[str, Any]]:
 def laptop() -> dict[str, Any]:
     """Return settings with which a robot walks soon on a CPU: few worlds, small networks, a short training."""
     return {
-        "linear_changes": 0.2,
+        "linear_changes": 0.3,
         "actor": {"hidden_dims": [128, 128]},
         "critic": {"hidden_dims": [128, 128]},
-        "runner": {"num_steps_per_env": 48, "total_steps": 15_000_000},
+        "runner": {"num_steps_per_env": 48, "total_steps": 20_000_000},
         "algorithm": {"num_mini_batches": 8},
         "evaluation": {"interval": 500_000, "num_samples": 16_000},
     }
