@@ -2,6 +2,7 @@
 
 Examples:
     python scripts/sim_robot.py                                   # a Go2 on interface lo, domain 1, as unitree_mujoco
+    python scripts/sim_robot.py --motors real --latency 5         # with its motors, which get commands 5 ms late
     python scripts/sim_robot.py --fault lost=0.3 --fault_at 20    # of whose messages a third is lost after 20 s
 """
 
@@ -18,22 +19,25 @@ from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, NotNegative, Positive
 
 RATE = 500.0  # messages per second, as a Go2
-ROBOTS = {"go2": "resources/robots/go2/go2.xml"}
+TASKS = {"go2": "go2_position"}  # whose settings have the robot's file and motors
 LINE_EVERY = 1.0  # seconds between two lines of the state
 
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
     parser = cli.Parser(__doc__)
-    parser.add_argument("--robot", choices=tuple(ROBOTS), default="go2", help="default: %(default)s")
+    parser.add_argument("--robot", choices=tuple(TASKS), default="go2", help="default: %(default)s")
     parser.add_argument("--interface", default="lo", help="network interface; default: %(default)s")
     parser.add_argument("--domain", type=int, default=1, help="of DDS; default: %(default)s, as unitree_mujoco")
     parser.add_argument("--seconds", type=float, help="end after this time; default: with Ctrl-C")
+    parser.add_argument("--motors", default="ideal", help="one of motors.choices: ideal, real, ...; default: ideal")
+    parser.add_argument("--latency", type=float, default=0.0, help="of commands [ms]; default: 0")
     hint = "lost, damaged (shares of messages), delay [s], silent=1; dead, hot or error=JOINT; may be repeated"
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
     parser.add_argument("--fault_at", type=float, default=0.0, help="second at which faults begin; default: at once")
     args = parser.parse_args()
-    cli.check_args(args, seconds=Positive, fault_at=NotNegative, domain=Annotated[int, Limits(0, 232)])
+    limits = {"domain": Annotated[int, Limits(0, 232)], "latency": Annotated[float, Limits(0, 1000)]}
+    cli.check_args(args, seconds=Positive, fault_at=NotNegative, **limits)
     return args
 
 
@@ -41,12 +45,16 @@ def main() -> None:
     """Simulate until the end, and print a line now and then."""
     args = parse_args()
     with cli.slow_imports():
+        from legged_torque.envs import task_registry
         from legged_torque.runtime.dds import Go2Side
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.sim_robot import Faults, SimRobot
         from legged_torque.runtime.unitree_go2 import encode_state
+    cfg, _ = task_registry.get_cfgs(TASKS[args.robot])
+    cfg.motors.choose(args.motors)
     side = Go2Side(args.interface, args.domain)
-    robot = SimRobot(resource_path(ROBOTS[args.robot]), side.joint_order, RATE)
+    motors = {"motors": cfg.motors, "latency": args.latency / 1e3}
+    robot = SimRobot(resource_path(cfg.asset.file), side.joint_order, RATE, **motors)
     faults, start = with_faults(Faults(), args.fault, side.joint_order), time.monotonic()
 
     def tick(now: float, missed: bool) -> None:

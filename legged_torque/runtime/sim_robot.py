@@ -3,10 +3,13 @@
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
+from legged_torque.motors.model_config import MotorsCfg
+from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import loading
@@ -34,7 +37,7 @@ class Faults:
 class SimRobot:
     """A robot of an MJCF, whose drives do what Unitree's do, at the rate of the physics.
 
-    A drive gives tau + kp (q - position) + kd (dq - velocity) within its torque limit. Without commands it damps.
+    A drive asks its motor for tau + kp (q - position) + kd (dq - velocity). Without commands it damps.
 
     Attributes:
         joint_order: Names of the joints.
@@ -46,10 +49,19 @@ class SimRobot:
         is_damping: Whether the drives only damp now.
     """
 
-    def __init__(self, xml: Path, joint_order: list[str], rate: float, seed: int = 0) -> None:
+    def __init__(
+        self,
+        xml: Path,
+        joint_order: list[str],
+        rate: float,
+        seed: int = 0,
+        motors: MotorsCfg | None = None,
+        latency: float = 0.0,
+    ) -> None:
         """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second.
 
-        A UserError if the file is unreadable, or the robot has other joints than hips, thighs and calves.
+        Its motors are ideal unless their settings are given, and commands reach them after ``latency`` [s]. A UserError
+        if the file is unreadable, or the robot has other joints than hips, thighs and calves.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -66,7 +78,13 @@ class SimRobot:
         owners = self.model.actuator_trnid[:, 0].tolist()
         self._motors = np.array([owners.index(joint.id) for joint in joints])
         self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
-        self._steps, self._rng, self.faults = round(1.0 / (rate * STEP)), np.random.default_rng(seed), Faults()
+        self._steps = round(1.0 / (rate * STEP))
+        self._drives = MotorTwin(self._description(motors))
+        armatures = motors.armature(joint_order) if motors else {}
+        for name, armature in armatures.items():
+            self.model.dof_armature[self.model.joint(name).dofadr[0]] = armature
+        self._latency, self._on_their_way = latency, deque[tuple[float, MotorCommand]]()
+        self._rng, self.faults = np.random.default_rng(seed), Faults()
         self.watchdog_ticks, self.excess, self.is_damping = 0, 0.0, True
         self._command: MotorCommand | None = None
         self._age, self._tick = np.inf, 0
@@ -87,20 +105,35 @@ class SimRobot:
         period = self._steps * STEP
         self._age += period
         if isinstance(received.newest, MotorCommand):
-            self._command, self._age = received.newest, 0.0
+            self._on_their_way.append((self.data.time + self._latency, received.newest))
+            self._age = 0.0
             asked = self._torques(received.newest)
             low, high = self.limits
             self.excess = max(self.excess, float(np.maximum(asked - high, low - asked).max()))
-        self.is_damping = self._command is None or self._age > WATCHDOG
-        self.watchdog_ticks += self._command is not None and self.is_damping
         zeros = np.zeros(len(self.joint_order))
-        command = self._command if self._command and not self.is_damping else None
-        command = command or MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING)
+        damping, had_command = MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING), self._command is not None
         is_dead = np.isin(self.joint_order, self.faults.dead)
+        self._drives.begin()
         for _ in range(self._steps):
-            self._applied = np.where(is_dead, 0.0, np.clip(self._torques(command), *self.limits))
+            while self._on_their_way and self._on_their_way[0][0] <= self.data.time + 1e-9:
+                self._command = self._on_their_way.popleft()[1]
+            command = self._command if self._age <= WATCHDOG else None
+            self.is_damping = command is None
+            asked = self._torques(command or damping)
+            pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]
+            self._applied = np.where(is_dead, 0.0, self._drives.apply(asked, pos, vel))
             self.data.ctrl[self._motors] = self._applied
             mujoco.mj_step(self.model, self.data)
+        self.watchdog_ticks += had_command and self.is_damping
+
+    def _description(self, motors: MotorsCfg | None) -> dict[str, Any]:
+        """Return what the motors read of a ``policy.yaml``, at the rate of the physics."""
+        names, zeros = self.joint_order, dict.fromkeys(self.joint_order, 0.0)
+        limits = {name: [float(low), float(high)] for name, low, high in zip(names, *self.limits, strict=True)}
+        timing = {"decimation": self._steps, "physics_frequency": 1.0 / STEP}
+        gains = {"stiffness": zeros, "damping": zeros}
+        described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
+        return {**described, "gains": gains, "motors": motors.describe() if motors else {}}
 
     def _torques(self, command: MotorCommand) -> np.ndarray:
         """Return what the drives are asked for now [N m]."""

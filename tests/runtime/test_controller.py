@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from support.control import JOINTS
 from support.exports import export_random
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
+from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
 from legged_torque.runtime.controller import Controller, Mode, drive_command
 from legged_torque.runtime.in_process import InProcess
@@ -48,6 +50,22 @@ class World:
         assert self.controller.request(Mode.STAND) == ""
         self.run(round(3.5 * RATE))
         return self
+
+
+def test_motors_and_latency():
+    """A torque comes late by the latency and then rises as its lag says."""
+    motors, lagging = task_registry.get_cfgs("a1_position")[0].motors, 0.01
+    motors.chain, motors.lag.time_constant = ["ideal", "lag"], lagging
+    names = [f"{name}_joint" for name in JOINTS]
+    robot = SimRobot(resource_path("resources/robots/a1/a1.xml"), names, RATE, motors=motors, latency=0.006)
+    zeros, seen = np.zeros(12), []
+    command = Received(MotorCommand(zeros + 3.0, zeros, zeros, zeros, zeros))
+    for _ in range(10):
+        robot.step(command)
+        seen.append(robot.says()[0].joint_torques.copy())
+    steps = np.arange(2, 21, 2) - 6.0  # of 1 ms since the torque has arrived
+    expected = 3.0 * (1.0 - np.exp(-np.maximum(steps, 0.0) * 1e-3 / lagging))
+    np.testing.assert_allclose(seen, np.repeat(expected[:, None], 12, axis=1), atol=1e-5)
 
 
 def random_state(rng, joints=12):
