@@ -43,6 +43,7 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--seconds", type=float, help="end after this time; default: when asked to")
     parser.add_argument("--walk", action="store_true", help="stand up and walk without being asked; simulation only")
+    parser.add_argument("--log", type=Path, help="new MCAP file for every tick; replay.py reads it")
     args = parser.parse_args()
     cli.check_args(args, rate=Rate, seconds=Positive, command=list[float], domain=Annotated[int, Limits(0, 232)])
     if args.walk and args.interface not in ("sim", "lo"):
@@ -62,7 +63,8 @@ def main() -> None:
     policy = Policy(args.policy)
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
-    session, operator = Session(controller, transport), Operator(controller, walks=args.walk)
+    session = Session(controller, transport, new_log(args.log, controller) if args.log else None)
+    operator = Operator(controller, walks=args.walk)
     operator.command(args.command)
     end = time.monotonic() + (args.seconds or float("inf"))
     try:
@@ -70,6 +72,8 @@ def main() -> None:
             next_line = time.monotonic()
             while not stop.requested and not operator.has_ended and time.monotonic() < end and loop.error is None:
                 operator.look()
+                if session.log:
+                    session.log.write()
                 if time.monotonic() >= next_line:
                     next_line += LINE_EVERY
                     print(session.line(loop), flush=True)
@@ -81,6 +85,13 @@ def main() -> None:
         raise loop.error
     if session.stops:
         sys.exit(1)
+
+
+def new_log(file: Path, controller: Any) -> Any:
+    """Return the log of a controller."""
+    from legged_torque.runtime.log import Log
+
+    return Log(file, controller)
 
 
 def connect(args: argparse.Namespace, policy: Any) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake, torques_of
-from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
 
@@ -36,6 +36,7 @@ class Controller:
         state: The newest state; None before the first.
         velocity_command: v_x, v_y [m/s] and yaw rate [rad/s] for the policy. Shape: (3,).
         sent: The last command.
+        policy_step: What the policy has seen and done in this tick; None if it was not asked.
         period: Time between two ticks [s].
     """
 
@@ -62,6 +63,7 @@ class Controller:
         self._since, self._state_time, self._now, self._missed, self._damaged = 0.0, -np.inf, 0.0, 0, 0
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
         self.sent, self._lock = self._gentle(0.0), threading.Lock()
+        self.policy_step: PolicyStep | None = None
 
     def _find_joints(self, joint_order: list[str]) -> None:
         """Put the limits of the policy's joints into the robot's order; a UserError if it needs what is not there."""
@@ -136,6 +138,7 @@ class Controller:
             missed: Whether the last deadline was missed.
         """
         with self._lock:
+            self.policy_step = None
             try:
                 self.sent = self._step(received, now, missed)
             except Exception as error:  # whatever it is, the robot must not be left without a command
@@ -197,7 +200,9 @@ class Controller:
                 state.joint_velocities[to_policy],
                 quaternion=state.quaternion,
             )
-            self._actions = policy.act(policy.observation(seen, self.velocity_command))
+            obs = policy.observation(seen, self.velocity_command)
+            self._actions = policy.act(obs)
+            self.policy_step = PolicyStep(obs, self._actions, is_first=self._tick == 0)
         self._tick += 1
         command = drive_command(policy, self._actions)
         command = MotorCommand(*(part[self._order].astype(float) for part in vars(command).values()))

@@ -42,6 +42,15 @@ class Received:
     problems: list[str] = field(default_factory=list)  # of another kind: mode, version
 
 
+@dataclass
+class PolicyStep:
+    """What a policy saw and did."""
+
+    observations: np.ndarray  # (observations,), float32
+    actions: np.ndarray  # (actions,), float32
+    is_first: bool  # whether the policy has just started
+
+
 class Transport(Protocol):
     """The robot as the program sees it. A new one is one file.
 

@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +21,12 @@ class Session:
         controller: The controller.
         counts: Messages, and those that were damaged, lost or late.
         stops: Reasons of all stops, in order.
+        log: Where the ticks are kept; None if nowhere.
     """
 
-    def __init__(self, controller: Controller, transport: Transport) -> None:
-        """Prepare; nothing is sent yet."""
-        self.controller, self._transport = controller, transport
+    def __init__(self, controller: Controller, transport: Transport, log: Any = None) -> None:
+        """Prepare; nothing is sent yet. ``log``, a :class:`~legged_torque.runtime.log.Log`, gets every tick."""
+        self.controller, self._transport, self.log = controller, transport, log
         self.counts: Counter[str] = Counter()
         self.stops: list[str] = []
 
@@ -37,6 +39,8 @@ class Session:
         self._transport.send(self.controller.step(received, now, missed))
         if self.controller.reason and self.controller.reason != before:
             self.stops.append(self.controller.reason)
+        if self.log:
+            self.log.add(now, missed, received)
 
     def close(self) -> None:
         """Leave the robot in damping, after the loop has ended."""
@@ -46,6 +50,8 @@ class Session:
             self.tick(time.monotonic(), missed=False)
             time.sleep(self.controller.period)
         self._transport.close()
+        if self.log:
+            self.log.close()
 
     def line(self, loop: RealTimeLoop) -> str:
         """Return the state in a line: mode, command, torques against limits, temperature, ticks, messages."""
@@ -59,5 +65,6 @@ class Session:
             parts.append(f"torque {share[worst]:.0%} of {controller.joints.names[worst]}'s limit")
             parts.append(f"motors {state.temperatures.max():.0f} deg C")
         parts.append(f"ticks {loop.ticks}, 99.9% within {1e3 * loop.lateness(0.999):.2f} ms")
+        parts += [self.log.problem] if self.log and self.log.problem else []
         parts += [f"{name} {count}" for name, count in self.counts.items() if count and name != "messages"]
         return "; ".join(parts)

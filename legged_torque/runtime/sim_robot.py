@@ -92,12 +92,13 @@ class SimRobot:
         self._applied = np.zeros(len(joint_order))
         self.lie_down()
 
-    def lie_down(self) -> None:
-        """Lay the robot on its belly, with folded legs."""
+    def lie_down(self, joint_positions: np.ndarray | None = None) -> None:
+        """Lay the robot on its belly, with folded legs, or with these joint positions [rad]. Shape: (joints,)."""
         mujoco.mj_resetData(self.model, self.data)
         low, high = self.model.jnt_range[[self.model.joint(name).id for name in self.joint_order]].T
-        pose = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
-        self.data.qpos[self._qpos], self.data.qpos[2] = np.clip(pose, low, high), 0.15
+        folded = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
+        self.data.qpos[self._qpos] = np.clip(folded, low, high) if joint_positions is None else joint_positions
+        self.data.qpos[2] = 0.15
         mujoco.mj_forward(self.model, self.data)
 
     def step(self, received: Received) -> None:

@@ -102,8 +102,12 @@ def test_over_the_wire_as_in_process(exported, tmp_path):
 
 def test_scripts(make_task, exported, tmp_path):
     """Both scripts begin and end by themselves; what they are told wrongly is refused in one line."""
-    status, output, _ = run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.3", root=tmp_path)
+    own = [str(exported), "--interface=sim", "--seconds=0.3", "--log=log.mcap"]
+    status, output, _ = run_here("deploy.py", *own, root=tmp_path)
     assert status == 0 and "damping" in output and "99.9% within" in output
+    replay = ["replay.py", "log.mcap", f"--policy={exported}"]
+    status, output, _ = run_here(*replay, "--plot=gap.png", root=tmp_path)
+    assert status == 0 and "RL_calf_joint: never; 0.0000" in output and (tmp_path / "gap.png").stat().st_size > 1000
     words = ["--interface=lo", f"--domain={OTHER}", "--seconds=0.3"]
     assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
     status, output, _ = run_here("sim_robot.py", *words, "--fault=hot=FR_hip_joint", "--fault=lost=1", root=tmp_path)
@@ -113,12 +117,15 @@ def test_scripts(make_task, exported, tmp_path):
         ("deploy.py", ["--interface=sim", "--rate=333"], "multiple of the policy's 50 Hz"),
         ("deploy.py", ["--interface=sim", "--command", "2", "0", "0"], "lin_vel_x of --command must be from -1 to 1"),
         ("deploy.py", ["--interface=eth0", "--walk"], "a real one waits for its operator"),
+        ("deploy.py", ["--interface=sim", "--log=log.mcap"], "cannot write the log 'log.mcap'"),
+        ("sim_robot.py", ["--motors=rael"], "did you mean 'real'?"),
         ("sim_robot.py", ["--fault=lots=1"], "unknown fault 'lots'; did you mean 'lost'?"),
         ("sim_robot.py", ["--fault=dead=FR_hip"], "did you mean 'FR_hip_joint'?"),
         ("sim_robot.py", ["--fault=lost=many"], "takes a number, not 'many'"),
     ):
         given = [str(exported)] if script == "deploy.py" else []
         assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)
+    assert_told_in_one_line(run_here(*replay, "--limit=-1", root=tmp_path), "limit")
     export_random(make_task, "a1_torque", tmp_path / "a1")
     refused = run_here("deploy.py", "a1", "--interface=lo", root=tmp_path)
     assert_told_in_one_line(refused, "the policy is of the robot 'a1'")

@@ -65,7 +65,7 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
     def presets(self) -> dict[str, dict[str, Any]]:
         """Return those of other approaches; on a laptop, heads are small and the PD part fades once the robot walks."""
         named = super().presets()
-        laptop, fading = named["laptop"], {"t_start": 6_000_000, "t_end": 12_000_000}
+        laptop, fading = named["laptop"], {"t_start": 9_000_000, "t_end": 16_000_000}
         laptop["actor"] |= {"head_hidden_dims": [64]}
         laptop["runner"] |= {"walks_after": 5_500_000}  # the latest of four seeds of the A1, docs/results/laptop.csv.gz
         laptop["control"] = {"mixing": {"pd": fading}}

@@ -1,0 +1,154 @@
+"""Logs of every tick as MCAP, which Foxglove opens, with messages in JSON."""
+
+import contextlib
+import io
+import struct
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged_torque.runtime.controller import Controller
+from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
+from legged_torque.utils.errors import UserError
+
+try:
+    import orjson
+    from mcap.exceptions import EndOfFile, McapError
+    from mcap.records import Channel, McapRecord, Message, Metadata
+    from mcap.stream_reader import StreamReader
+    from mcap.writer import Writer
+except ImportError as error:
+    raise UserError(f"logs need the extra: pip install 'legged_torque[robot]' ({error})") from None
+
+TICK, POLICY, ROBOT = "tick", "policy", "robot"
+"""Channels: each tick; each step of the policy. And the metadata: whose log this is."""
+_NS = 1e9
+_CHUNK = 2**16  # bytes that are written at a time
+
+
+class Log:
+    """Writes what a controller does; :meth:`add` takes no time in the control loop, :meth:`write` does the work.
+
+    A log that was not closed can be read too, but for its last 64 KB. A disk that is full does not stop the robot.
+
+    Attributes:
+        problem: Why nothing is written any more; empty as long as all is well.
+    """
+
+    problem = ""
+
+    def __init__(self, file: Path, controller: Controller) -> None:
+        """Begin a file; a UserError if it exists, or its folder does not."""
+        try:
+            self._file = file.open("xb")
+        except OSError as error:
+            raise UserError(f"cannot write the log '{file}': {error.strerror}") from None
+        self._controller, self._waiting = controller, deque[tuple[str, float, dict[str, Any]]]()
+        self._writer = Writer(self._file, chunk_size=_CHUNK)
+        self._writer.start(profile="", library="legged_torque")
+        description = controller.policy.description
+        names = orjson.dumps(controller.joints.names).decode()
+        about = {"joint_order": names, "sha256": description["network"]["sha256"], "task": description["task"]}
+        self._writer.add_metadata(ROBOT, about | {"period": repr(controller.period)})
+        self._channels = {name: self._channel(name) for name in (TICK, POLICY)}
+
+    def _channel(self, name: str) -> int:
+        """Return a new channel of objects."""
+        schema = self._writer.register_schema(name, "jsonschema", b'{"type": "object"}')
+        return self._writer.register_channel(name, "json", schema)
+
+    def add(self, now: float, missed: bool, received: Received) -> None:
+        """Keep a tick that has just been made, at a time [s]."""
+        controller, step = self._controller, self._controller.policy_step
+        state = received.newest if isinstance(received.newest, RobotState) else None
+        tick: dict[str, Any] = {"mode": controller.mode.value, "reason": controller.reason, "missed": missed}
+        tick |= {"damaged": received.wrong_crc, "lost": received.lost, "late": received.late}
+        tick |= {"velocity_command": controller.velocity_command.copy()}
+        self._waiting.append((TICK, now, tick | {"state": state, "command": controller.sent}))
+        if step is not None:
+            self._waiting.append((POLICY, now, vars(step)))
+
+    def write(self) -> None:
+        """Write what has been added since the last call."""
+        try:
+            while self._waiting:
+                channel, now, message = self._waiting.popleft()
+                data = orjson.dumps(_doubles(message), option=orjson.OPT_SERIALIZE_NUMPY)
+                if not self.problem:
+                    self._writer.add_message(self._channels[channel], round(now * _NS), data, round(now * _NS))
+            self._file.flush()
+        except OSError as error:
+            self.problem = f"the log ends here: {error.strerror or error}"
+
+    def close(self) -> None:
+        """Write the rest, and end the file."""
+        self.write()
+        try:
+            self._writer.finish()
+            self._file.close()
+        except OSError as error:
+            self.problem = f"the log has no end: {error.strerror or error}"
+
+
+class RecordedLog:
+    """A log that is read.
+
+    Attributes:
+        joint_order: Names of the joints.
+        sha256: Of the policy's network.
+        task: That the policy was trained on.
+        period: Time between two ticks [s].
+    """
+
+    def __init__(self, file: Path) -> None:
+        """Open a log; a UserError if it is none."""
+        try:
+            self._content = file.read_bytes()
+            about = next(each.metadata for each in self._records() if isinstance(each, Metadata) and each.name == ROBOT)
+            self.joint_order: list[str] = orjson.loads(about["joint_order"])
+            self.sha256, self.task, self.period = about["sha256"], about["task"], float(about["period"])
+        except OSError as error:
+            raise UserError(f"cannot read '{file}': {error.strerror}") from None
+        except (McapError, StopIteration, KeyError, ValueError) as error:
+            raise UserError(f"'{file}' is no log of deploy.py: {error or 'it does not say whose'}") from None
+
+    def ticks(self) -> Iterator[tuple[float, RobotState | None, MotorCommand, dict[str, Any]]]:
+        """Yield time [s], state, command and the rest of each tick."""
+        for time, message in self._messages(TICK):
+            state, command = message.pop("state"), message.pop("command")
+            yield time, state and RobotState(**_arrays(state)), MotorCommand(**_arrays(command)), message
+
+    def policy_steps(self) -> Iterator[PolicyStep]:
+        """Yield the steps of the policy."""
+        for _, message in self._messages(POLICY):
+            seen, done = (np.array(message[name], float).astype(np.float32) for name in ("observations", "actions"))
+            yield PolicyStep(seen, done, message["is_first"])
+
+    def _messages(self, channel: str) -> Iterator[tuple[float, Any]]:
+        """Yield times and contents of a channel's messages."""
+        number = None
+        for record in self._records():
+            if isinstance(record, Channel) and record.topic == channel:
+                number = record.id
+            if isinstance(record, Message) and record.channel_id == number:
+                yield record.log_time / _NS, orjson.loads(record.data)
+
+    def _records(self) -> Iterator[McapRecord]:
+        """Yield what the file has, up to where it was cut off."""
+        with contextlib.suppress(EndOfFile, struct.error):
+            yield from StreamReader(io.BytesIO(self._content)).records
+
+
+def _doubles(values: dict[str, Any]) -> dict[str, Any]:
+    """Return values with arrays of doubles, whose text is exact, for those of float32."""
+    inner = {name: vars(value) for name, value in values.items() if isinstance(value, (RobotState, MotorCommand))}
+    values = values | {name: _doubles(value) for name, value in inner.items()}
+    return {name: value.astype(float) if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+
+def _arrays(values: dict[str, Any]) -> dict[str, Any]:
+    """Return lists as arrays; null, which was no number, is NaN."""
+    return {name: np.array(value, float) if isinstance(value, list) else value for name, value in values.items()}

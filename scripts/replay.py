@@ -1,0 +1,78 @@
+"""Play a log of deploy.py once more: does the policy do the same, and where does a simulated robot part from it?
+
+Example:
+    python scripts/replay.py walk.mcap --policy exported --motors real --latency 5 --plot gap.png
+"""
+
+import argparse
+from pathlib import Path
+from typing import Annotated, Any
+
+from legged_torque import resource_path
+from legged_torque.utils import cli
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_errors
+from legged_torque.utils.limits import Limits, Positive
+
+
+def parse_args() -> argparse.Namespace:
+    """Parse and check the command line."""
+    parser = cli.Parser(__doc__)
+    parser.add_argument("log", type=Path, help="MCAP file of deploy.py --log")
+    parser.add_argument("--policy", type=Path, required=True, help="policy.yaml, policy.onnx, or the folder of both")
+    parser.add_argument("--motors", default="ideal", help="of the simulated robot: ideal, real, ...; default: ideal")
+    parser.add_argument("--latency", type=float, default=0.0, help="of its commands [ms]; default: 0")
+    parser.add_argument("--limit", type=float, default=0.1, help="gap at which they part [rad]; default: %(default)s")
+    parser.add_argument("--plot", type=Path, help="figure of all joints; needs the extra 'plots'")
+    args = parser.parse_args()
+    cli.check_args(args, latency=Annotated[float, Limits(0, 1000)], limit=Positive)
+    return args
+
+
+def main() -> None:
+    """Print what has become of policy and robot."""
+    args = parse_args()
+    with cli.slow_imports():
+        from legged_torque.deploy.policy import Policy
+        from legged_torque.envs import task_registry
+        from legged_torque.runtime.log import RecordedLog
+        from legged_torque.runtime.replay import same_actions, simulate
+        from legged_torque.runtime.sim_robot import SimRobot
+    log, policy = RecordedLog(args.log), Policy(args.policy)
+    steps, equal = same_actions(log, policy)
+    print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
+    motors = task_registry.get_cfgs(policy.description["task"])[0].motors
+    motors.choose(args.motors)
+    xml, rate = resource_path(policy.description["robot"]["file"]), 1.0 / log.period
+    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=motors, latency=args.latency / 1e3))
+    parts = gap.parts_at(args.limit)
+    until = min(parts.min(), gap.times[-1])
+    print(f"joint: parts by {args.limit:g} rad at [s]; rms gap in the first {until:.2f} s [rad]")
+    for name, at, rms in zip(log.joint_order, parts, gap.rms(until), strict=True):
+        print(f"  {name}: {'never' if at == float('inf') else f'{at:.2f}'}; {rms:.4f}")
+    if args.plot:
+        plot(gap, log.joint_order, args.plot)
+
+
+def plot(gap: Any, names: list[str], file: Path) -> None:
+    """Draw positions of all joints, logged and simulated."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError("--plot needs the extra: pip install 'legged_torque[plots]'") from None
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    axes = figure.subplots(-(-len(names) // 3), 3, sharex=True, squeeze=False)
+    for axis, name, logged, simulated in zip(axes.flat, names, gap.logged.T, gap.simulated.T, strict=False):
+        axis.plot(gap.times, logged, label="log")
+        axis.plot(gap.times, simulated, label="simulated", linestyle="--")
+        axis.set_title(name, fontsize="small")
+    axes.flat[0].legend()
+    figure.supxlabel("time [s]")
+    figure.supylabel("joint position [rad]")
+    with write_errors(file):
+        figure.savefig(file)
+    print(f"wrote {file}")
+
+
+if __name__ == "__main__":
+    cli.run_script(main)

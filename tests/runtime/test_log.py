@@ -1,0 +1,122 @@
+"""Logs of every tick: what was written is read, the policy does the same on it, and a simulated robot parts from it."""
+
+import sys
+from pathlib import Path
+from resource import RLIMIT_FSIZE, getrlimit, setrlimit
+
+import numpy as np
+import pytest
+from support.exports import export_random
+from support.settings import error_of
+
+from legged_torque import resource_path
+from legged_torque.deploy.policy import Policy
+from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.log import Log, RecordedLog
+from legged_torque.runtime.replay import same_actions, simulate
+from legged_torque.runtime.session import Session
+from legged_torque.runtime.sim_robot import SimRobot
+
+RATE, STAND, WALK = 500.0, 1700, 150  # ticks of each
+DEAD = STAND + 60  # tick at which a motor dies
+
+
+def robot_of(policy):
+    """A robot that lies."""
+    return SimRobot(resource_path(policy.description["robot"]["file"]), policy.joint_order, RATE)
+
+
+@pytest.fixture(scope="module")
+def policy(make_task, tmp_path_factory):
+    """A random policy."""
+    folder = tmp_path_factory.mktemp("log") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return Policy(folder)
+
+
+@pytest.fixture(scope="module")
+def recorded(policy, tmp_path_factory):
+    """A log of standing up and a policy, in which a motor dies; all that was said and sent; a copy of it not closed."""
+    robot, folder = robot_of(policy), tmp_path_factory.mktemp("logs")
+    wire, controller = InProcess(robot), Controller(policy, policy.joint_order, RATE)
+    session, seen = Session(controller, wire, Log(folder / "log.mcap", controller)), []
+    step = controller.step
+    controller.step = lambda received, *args: (seen.append((received.newest, step(received, *args))), seen[-1][1])[1]
+    for tick in range(STAND + WALK):
+        if tick in (5, STAND):
+            assert controller.request(Mode.STAND if tick == 5 else Mode.POLICY) == ""
+        robot.faults.dead = ["RR_calf_joint"] if tick >= DEAD else []
+        robot.faults.not_finite = tick == STAND + WALK - 3
+        session.tick(tick / RATE, missed=tick == 7)
+        session.log.write()
+    (folder / "cut.mcap").write_bytes((folder / "log.mcap").read_bytes())
+    session.log.close()
+    return folder, seen
+
+
+def test_what_was_written_is_read(policy, recorded):
+    """States and commands are those of each tick, to the bit; so are the reasons of stops."""
+    folder, seen = recorded
+    log = RecordedLog(folder / "log.mcap")
+    assert (log.joint_order, log.period) == (policy.joint_order, 1 / RATE)
+    ticks = list(log.ticks())
+    assert len(ticks) == len(seen) == STAND + WALK
+    for number, ((time, state, command, rest), (said, sent)) in enumerate(zip(ticks, seen, strict=True)):
+        assert time == pytest.approx(number / RATE) and rest["missed"] == (number == 7)
+        for one, other in ((state, said), (command, sent)):
+            for name, value in vars(other).items():
+                assert np.array_equal(getattr(one, name), value, equal_nan=True)
+    assert ticks[STAND + 5][3]["mode"] == "policy" and "finite" in ticks[-1][3]["reason"]
+    cut = list(RecordedLog(folder / "cut.mcap").ticks())
+    assert STAND < len(cut) < len(ticks) and cut[-1][0] == ticks[len(cut) - 1][0]
+
+
+def test_the_policy_does_the_same(policy, recorded, make_task, tmp_path):
+    """Its actions are the same, bit by bit; another policy is refused."""
+    log = RecordedLog(recorded[0] / "log.mcap")
+    steps, equal = same_actions(log, policy)
+    assert steps == equal == len(range(0, WALK - 3, 10))
+    export_random(make_task, "a1_torque_multihead", tmp_path / "other", normalization=True)
+    assert "another policy" in error_of(same_actions, log, Policy(tmp_path / "other"))
+
+
+def test_where_they_part(policy, recorded):
+    """A simulated robot under the same commands does the same, until a motor dies in the log."""
+    log = RecordedLog(recorded[0] / "log.mcap")
+    gap = simulate(log, robot_of(policy))
+    before = gap.times <= DEAD / RATE
+    assert np.array_equal(gap.simulated[before], gap.logged[before]) and not gap.rms(DEAD / RATE).any()
+    parts = gap.parts_at(0.02)
+    assert DEAD / RATE < parts[policy.joint_order.index("RR_calf_joint")] == parts.min() < DEAD / RATE + 0.1
+
+
+def test_mistakes(policy, recorded, tmp_path, monkeypatch):
+    """A file that exists, one that is no log, and missing packages: one line each."""
+    controller = Controller(policy, policy.joint_order, RATE)
+    assert "exists" in error_of(Log, recorded[0] / "log.mcap", controller)
+    (tmp_path / "no.mcap").write_bytes(b"something else")
+    assert "no log" in error_of(RecordedLog, tmp_path / "no.mcap")
+    assert "cannot read" in error_of(RecordedLog, Path("nowhere.mcap"))
+    monkeypatch.delitem(sys.modules, "legged_torque.runtime.log")
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    assert "legged_torque[robot]" in error_of(__import__, "legged_torque.runtime.log")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of file sizes")
+def test_full_disk(policy, tmp_path):
+    """The robot goes on without its log, which says so and can be read as far as it goes."""
+    wire, controller = InProcess(robot_of(policy)), Controller(policy, policy.joint_order, RATE)
+    session, limits = Session(controller, wire, Log(tmp_path / "log.mcap", controller)), getrlimit(RLIMIT_FSIZE)
+    setrlimit(RLIMIT_FSIZE, (300_000, limits[1]))
+    try:
+        for tick in range(1000):
+            session.tick(tick / RATE, missed=False)
+            session.log.write()
+            if tick == 5:
+                controller.request(Mode.STAND)
+        session.log.close()
+    finally:
+        setrlimit(RLIMIT_FSIZE, limits)
+    assert controller.mode == Mode.STAND and "the log" in session.log.problem
+    assert 100 < len(list(RecordedLog(tmp_path / "log.mcap").ticks())) < 1000
