@@ -1,6 +1,7 @@
 """Play a log of deploy.py once more: does the policy do the same, and where does a simulated robot part from it?
 
-Example:
+Examples:
+    python scripts/replay.py walk.mcap --policy exported
     python scripts/replay.py walk.mcap --policy exported --motors real --latency 5 --plot gap.png
 """
 
