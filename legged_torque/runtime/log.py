@@ -1,4 +1,4 @@
-"""Logs of every tick as MCAP, which Foxglove opens, with messages in JSON."""
+"""Logs of every tick as MCAP, a format of Foxglove, with messages in JSON."""
 
 import contextlib
 import io
@@ -30,7 +30,7 @@ _CHUNK = 2**16  # bytes that are written at a time
 
 
 class Log:
-    """Writes what a controller does; :meth:`add` takes no time in the control loop, :meth:`write` does the work.
+    """Writes what a controller does; the control loop only keeps ticks by :meth:`add`; :meth:`write` does the work.
 
     A log that was not closed can be read too, but for its last 64 KB. A disk that is full does not stop the robot.
 

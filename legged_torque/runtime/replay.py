@@ -18,12 +18,12 @@ def same_actions(log: RecordedLog, policy: Policy) -> tuple[int, int]:
     """
     if policy.description["network"]["sha256"] != log.sha256:
         raise UserError("the log is of another policy: the networks' checksums differ")
-    equal = [False]
-    for number, step in enumerate(log.policy_steps()):
+    equal = []
+    for step in log.policy_steps():
         if step.is_first:
             policy.reset()
-        equal[number:] = [np.array_equal(policy.act(step.observations), step.actions), False]
-    return len(equal) - 1, sum(equal)
+        equal.append(np.array_equal(policy.act(step.observations), step.actions))
+    return len(equal), sum(equal)
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Gap:
         return np.where(is_off.any(axis=0), self.times[is_off.argmax(axis=0)], np.inf)
 
     def rms(self, end: float) -> np.ndarray:
-        """Return the mean squared gap up to a time [s], its root [rad]. Shape: (joints,)."""
+        """Return the root mean square of the gap up to a time [s], in rad. Shape: (joints,)."""
         return np.sqrt(np.square(self.simulated - self.logged)[self.times <= end].mean(axis=0))
 
 
