@@ -43,39 +43,42 @@ def can_compile(device: str) -> bool:
     return has_triton(device) and tuple(map(int, torch.__version__.split(".")[:2])) >= FIRST_TORCH
 
 
-def compiled(function: Callable[[], None], device: str) -> Callable[[], None]:
+def compiled(function: Callable, device: str, learns: bool = False) -> Callable:
     """Return a function that does the same with few kernels; the function itself where it cannot be compiled.
 
-    It must only run operations of torch, on tensors that keep their addresses, and write in place.
+    It must only run operations of torch. What it keeps are tensors with fixed addresses, written in place. Its results
+    have gradients if it ``learns``.
     It is compiled at the first call, once per machine: the kernels are kept in a folder of Warp's cache. Where that
     is not possible, a line on standard error says so and names the place, and the function runs as it is.
     """
-    return Compiled(function) if can_compile(device) else function
+    return Compiled(function, learns) if can_compile(device) else function
 
 
 class Compiled:
     """A function that is compiled at its first call."""
 
-    def __init__(self, function: Callable[[], None]) -> None:
+    def __init__(self, function: Callable, learns: bool) -> None:
         """Prepare; nothing is compiled yet."""
         import torch._dynamo as dynamo  # takes a second, and only a GPU needs it
 
         keep_kernels()
         dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
         self._function, self._run, self._has_run = function, torch.compile(function, **SETTINGS), False
+        self._learns = learns
 
-    def __call__(self) -> None:
+    def __call__(self, *args: Any) -> Any:
         """Run the function, always in the same mode of autograd, since each mode would be compiled separately."""
-        with torch.inference_mode(False), torch.no_grad():
+        with torch.inference_mode(False), torch.set_grad_enabled(self._learns):
             try:
                 with contextlib.nullcontext() if self._has_run else torch_compiles():
-                    self._run()
+                    result = self._run(*args)
             except torch._dynamo.exc.TorchDynamoException as error:  # nothing has run yet
                 name = getattr(self._function, "__qualname__", str(self._function))
                 warn(f"{name} runs uncompiled, which is slower: {reason(error)}")
                 self._run = self._function
-                self._run()
+                result = self._run(*args)
             self._has_run = True
+            return result
 
 
 def keep_kernels() -> None:

@@ -26,7 +26,10 @@ PPO = "legged_torque.learning.ppo:OnDevicePPO"
 SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.")  # of learners
 READ = {
     PPO: ("algorithm.", "actor.", "critic."),
-    FLASHSAC: ("flashsac.", "algorithm.class_name", "algorithm.gamma", "algorithm.symmetry_cfg."),
+    FLASHSAC: (
+        "flashsac.",
+        *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision", "symmetry_cfg.")),
+    ),
     DISTILLATION: ("distillation.", "algorithm.class_name"),
 }
 """Beginnings of the paths of those settings that a learner reads; a user's own may read all."""

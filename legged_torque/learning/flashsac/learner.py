@@ -6,6 +6,7 @@ The names of settings are those of rsl_rl_flashsac, https://github.com/Holiday-R
 import copy
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -19,6 +20,7 @@ from legged_torque.learning.flashsac.networks import FlashSACActor, FlashSACCrit
 from legged_torque.learning.flashsac.replay import Batch, Replay
 from legged_torque.learning.flashsac.returns import RewardScale, lower_of, projected
 from legged_torque.learning.protocols import Transition
+from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError
 
@@ -45,6 +47,7 @@ class FlashSAC:
         symmetry: rsl_rl's extension that adds mirror images to samples, or None.
         num_updates: Gradient steps so far.
         graphs: The gradient steps with and without the actor.
+        uses_bfloat16: Whether losses multiply matrices of bfloat16 numbers; all else is float32.
     """
 
     capturable = True
@@ -96,6 +99,10 @@ class FlashSAC:
         self.num_updates = 0
         steps = {learns: functools.partial(self.take_gradient_step, learns) for learns in (True, False)}
         self.graphs = {learns: CudaGraph(step, device) for learns, step in steps.items()}
+        self._losses: dict[str, Callable] = {"actor": self.actor_loss, "critic": self.critic_loss}
+        self._bound: Callable = bound_weights
+        self._follow: Callable = self._move_target
+        self.uses_bfloat16 = False
 
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> "FlashSAC":
@@ -115,7 +122,16 @@ class FlashSAC:
         alg = cls(actor, critic, replay, settings, algorithm["gamma"], cfg["num_steps_per_env"], symmetry)
         for graph in alg.graphs.values():
             graph.enabled = cfg["capture"]
+        if cfg["capture"]:
+            alg.compile()
+        alg.uses_bfloat16 = algorithm["use_mixed_precision"] and torch.device(device).type == "cuda"
         return alg
+
+    def compile(self) -> None:
+        """Let losses and what bounds weights run as few kernels, where they can be compiled."""
+        device = self.replay.device
+        self._losses = {name: compiled(loss, device, learns=True) for name, loss in self._losses.items()}
+        self._bound, self._follow = compiled(self._bound, device), compiled(self._follow, device)
 
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
@@ -193,13 +209,15 @@ class FlashSAC:
         """Draw samples; let the actor learn from them, if it does, then the critic; let the target follow."""
         batch = self._sample()
         if actor_learns:
-            loss, numbers = self.actor_loss(batch)
-            self._descend("actor", loss, numbers, self.actor)
-        loss, numbers = self.critic_loss(batch)
-        self._descend("critic", loss, numbers, self.critic)
-        with torch.no_grad():
-            for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-                slow.lerp_(fast, self.settings["critic_target_update_tau"])
+            self._descend("actor", batch, self.actor)
+        self._descend("critic", batch, self.critic)
+        self._follow()
+
+    @torch.no_grad()
+    def _move_target(self) -> None:
+        """Let the target follow the critic."""
+        for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
+            slow.lerp_(fast, self.settings["critic_target_update_tau"])
 
     def _sample(self) -> Batch:
         """Return ``mini_batch_size`` samples, and their mirror images if symmetry is used."""
@@ -248,8 +266,10 @@ class FlashSAC:
         loss = (batch.weights * cross_entropy).sum() / batch.weights.sum()
         return loss, loss.detach().unsqueeze(0)
 
-    def _descend(self, name: str, loss: Tensor, numbers: Tensor, network: nn.Module) -> None:
-        """Take a step of the optimizer ``name``, bound the weights of its network, and sum up the numbers."""
+    def _descend(self, name: str, batch: Batch, network: nn.Module) -> None:
+        """Take a step of the optimizer ``name``, bound the weights of its network, and sum up the loss's numbers."""
+        with torch.autocast("cuda", torch.bfloat16, enabled=self.uses_bfloat16):
+            loss, numbers = self._losses[name](batch)
         optimizer = self.optimizers[name]
         parameters = optimizer.param_groups[0]["params"]
         optimizer.zero_grad()
@@ -257,7 +277,7 @@ class FlashSAC:
         norm = nn.utils.get_total_norm([parameter.grad for parameter in parameters])
         self._skip.copy_(~torch.isfinite(norm))
         optimizer.step()
-        bound_weights(network)
+        self._bound(network)
         made = 1.0 - self._skip
         all_numbers = torch.cat([numbers, torch.stack([norm, made])])
         self._sums[name] += torch.where(self._skip.bool(), 0.0, all_numbers)

@@ -33,8 +33,8 @@ class UnitLinear(nn.Module):
             nn.init.orthogonal_(weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return outputs. Shape: (..., samples, num_outputs)."""
-        return x @ self.weight.transpose(-1, -2)
+        """Return float32 outputs, whatever autocast multiplies. Shape: (..., samples, num_outputs)."""
+        return (x @ self.weight.transpose(-1, -2)).float()
 
     @torch.jit.unused
     def bound(self) -> None:

@@ -54,8 +54,8 @@ def projected(probs: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """
     bins = torch.arange(len(values), device=values.device)
     at = (places.clamp(values[0], values[-1]) - values[0]) * ((len(values) - 1) / (values[-1] - values[0]))
-    shares = (1.0 - (at.unsqueeze(-1) - bins).abs()).clamp(min=0.0)
-    return (probs.unsqueeze(-2) @ shares).squeeze(-2)
+    shares = (1.0 - (at.unsqueeze(-2) - bins.unsqueeze(-1)).abs()).clamp(min=0.0)
+    return (probs.unsqueeze(-2) * shares).sum(dim=-1)  # one kernel once it is compiled
 
 
 def lower_of(log_probs: Tensor, means: Tensor) -> Tensor:
