@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from legged_torque import resource_path
-from legged_torque.terrain.colors import NEUTRAL, color_of
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading, read_spec
@@ -34,6 +33,23 @@ COMMAND_COLOR, VELOCITY_COLOR = (0.1, 0.8, 0.2, 0.9), (0.1, 0.4, 1.0, 0.9)
 ARROW_RADIUS = 0.012  # of an arrow's shaft [m]
 
 RESOLUTION, MAX_PIXELS = 32.0, 4096  # of the picture: pixels per metre, and limit along a side
+NEUTRAL = (206, 208, 210)
+"""Of level ground, and of what lies around the tiles. Each color is red, green and blue, up to 255."""
+COLORS = {
+    "flat": NEUTRAL,
+    "smooth_slope_up": (176, 203, 164),
+    "smooth_slope_down": (143, 186, 158),
+    "rough_slope": (199, 193, 143),
+    "stairs_up": (151, 186, 213),
+    "stairs_down": (172, 172, 217),
+    "discrete_obstacles": (222, 177, 148),
+    "waves": (140, 200, 198),
+    "stepping_stones": (207, 166, 198),
+    "gaps": (224, 160, 160),
+    "pits": (228, 207, 140),
+}
+"""Of kinds of tiles: calm ones, on which dark robots are seen well."""
+OWN = (204, 190, 214)  # of kinds that users have added
 SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
 LINE_WIDTH = 1.2  # of lines and edges [pixels]
 STRAIGHT = 1e-6  # largest bend between neighbouring samples of a straight line [m]
@@ -171,7 +187,7 @@ class Ground:
             is_line, is_edge = (np.abs((place + 0.5 * step) % step - 0.5 * step) < half for step in steps)
             tiles.append(np.floor(place / layout.tile_size).astype(int))
             shades.append(np.where(is_edge, 2, is_line.astype(int)))
-        colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
+        colors = np.array([*(COLORS.get(kind, OWN) for kind in layout.kinds()), NEUTRAL])
         is_row = (tiles[0] >= 0) & (tiles[0] < layout.num_rows)
         is_col = (tiles[1] >= 0) & (tiles[1] < layout.num_cols)
         column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)
