@@ -34,15 +34,15 @@ LINES = {
     "legged_torque/sensors": 310,
     "legged_torque/sim": 5760,
     "legged_torque/terrain": 600,
-    "legged_torque/utils": 3070,
+    "legged_torque/utils": 3050,
     "legged_torque/viewer": 2340,
-    "scripts": 1660,
+    "scripts": 1650,
     "paper": 3000,
     "tools": 700,
     "tests": 22_010,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 29_800  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 29_770  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

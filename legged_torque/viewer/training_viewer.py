@@ -10,8 +10,8 @@ from pathlib import Path
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.display import warn
+from legged_torque.utils.distributed import ending_with_parent
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.processes import ending_with_parent
 from legged_torque.utils.runs import checkpoint_number
 from legged_torque.viewer.ports import free_port
 
