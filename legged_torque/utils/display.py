@@ -195,13 +195,9 @@ class Counter(Display):
 
 
 def times(task: Task) -> str:
-    """Return the times spent and left, "0:00:01, 0:00:03 left"; a field "left" of the task replaces rich's estimate."""
-    return f"{duration(task.elapsed or 0.0)}, {time_left_text(task.fields.get('left', task.time_remaining))}"
-
-
-def time_left_text(left: float | None) -> str:
-    """Return the time left [s] in words; None is unknown."""
-    return _UNKNOWN if left is None else f"{duration(left)} left"
+    """Return the times spent and left: "0:00:01, 0:00:03 left"."""
+    left = task.time_remaining
+    return f"{duration(task.elapsed or 0.0)}, {_UNKNOWN if left is None else f'{duration(left)} left'}"
 
 
 def read_progress(text: str) -> tuple[str, int, int, str] | None:
