@@ -50,8 +50,6 @@ def main() -> None:
     if args.agent != "policy":
         options.task = options.task or DEFAULT_TASK
     with cli.slow_imports():
-        import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
-
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(options.task, options)
     env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands

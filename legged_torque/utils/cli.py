@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import dataclasses
 import gc
-import importlib.util
 import os
 import re
 import shutil
@@ -192,8 +191,6 @@ def options_of(args: argparse.Namespace) -> Options:
     options = Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
     if options.task_file:
         with slow_imports():
-            if os.environ.get("MUJOCO_GL") == "osmesa" and importlib.util.find_spec("triton"):
-                importlib.import_module("triton")  # after MuJoCo, it crashes: it and OSMesa have different LLVMs
             task_registry.import_files(options.task_file)
     return options
 

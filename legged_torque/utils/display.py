@@ -106,7 +106,7 @@ class Display:
         if is_terminal(self._stream) and Display.shown is None:
             Display.shown = self
             self._console = Console(file=self._stream, highlight=False, markup=False)
-            self._live = _Live(
+            self._live = Live(
                 console=self._console,
                 refresh_per_second=1.0 / REDRAW_EVERY,
                 transient=not self._stays,
@@ -155,15 +155,6 @@ class Display:
             return SegmentLines(self._console.render_lines(self.view(), options, pad=False), new_lines=True)
         except Exception as error:  # of any number or name that is shown
             return Text(f"nothing to see: {type(error).__name__}: {error}")
-
-
-class _Live(Live):
-    """A view that is not redrawn any more when its terminal is gone."""
-
-    def refresh(self) -> None:
-        """Redraw."""
-        with contextlib.suppress(OSError):
-            super().refresh()
 
 
 class _Times(ProgressColumn):

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from legged_torque import resource_path
-from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading, read_spec
 
@@ -78,7 +77,7 @@ class Drawing:
     def of_task(cls, task: LeggedRobot) -> Drawing:
         """Return the robot of a task on its ground, with the joints in the task's order."""
         terrain: Any = task.terrain  # rough ground if it has a map
-        ground = Ground(terrain.layout, terrain.map) if terrain.map else None
+        ground = Ground(terrain.layout) if terrain.map else None
         return cls(drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground)
 
     def move(self, qpos: np.ndarray) -> None:
@@ -160,17 +159,16 @@ class Ground:
         faces: The triangles, counterclockwise as seen from above. Shape: (triangles, 3), int32.
     """
 
-    def __init__(self, layout: Layout, grid: HeightGrid) -> None:
-        """Divide a grid of heights with this layout into triangles."""
+    def __init__(self, layout: Layout) -> None:
+        """Divide the map of a layout into triangles."""
         self.layout = layout
-        self._heights, self._scale = grid.heights, grid.horizontal_scale
-        self._corner, size = np.array(grid.corner), np.array(grid.size)
+        self._heights, self._scale, self._corner = layout.heights(), layout.horizontal_scale, np.array(layout.corner)
         rectangles = patches(self._heights)
         rows, cols = rectangles[:, [0, 1, 1, 0]], rectangles[:, [2, 2, 3, 3]]
         samples, corners = np.unique(rows * self._heights.shape[1] + cols, return_inverse=True)
         places = np.stack(np.unravel_index(samples, self._heights.shape), axis=1) * self._scale
         self.vertices = np.column_stack([places + self._corner, self._heights.flat[samples]]).astype(np.float32)
-        self.uv = (places / size).astype(np.float32)
+        self.uv = (places / places.max(axis=0)).astype(np.float32)
         self._rectangles = corners.reshape(rows.shape)
         self.faces = self._rectangles[:, [0, 1, 2, 0, 2, 3]].astype(np.int32).reshape(-1, 3)
 

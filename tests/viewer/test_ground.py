@@ -23,7 +23,7 @@ def terrain():
 @pytest.fixture(scope="module")
 def ground(terrain):
     """The same, to be drawn."""
-    return Ground(terrain.layout, terrain.map)
+    return Ground(terrain.layout)
 
 
 def test_surface(terrain, ground):
