@@ -160,18 +160,19 @@ class NodeStep:
         write_files(root, files)
         with open(root / LOG, "wb") as output:
             self._process = LocalProcess(place, command_of(words), output, {}, cwd=root)
-        self._log = open(root / LOG, "rb")
+        self._reported = 0  # bytes of its log
         return Report(place)
 
     def report(self, send_every: float) -> Report:
         """Return news after a while; new files are sent at the end, and before every ``send_every`` seconds."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(REPORT_EVERY)
-        now, report = time.time(), Report(self._process.place, self._process.poll(), self._log.read())
+        now, root, report = time.time(), Path(self._folder.name), Report(self._process.place, self._process.poll())
+        log = (root / LOG).read_bytes()
+        report.log, self._reported = log[self._reported :], len(log)
         if report.status is not None or now - self._sent >= send_every:
-            report.files, self._sent = new_files(Path(self._folder.name), self._sent), now
+            report.files, self._sent = new_files(root, self._sent), now
         if report.status is not None:
-            self._log.close()
             self._folder.cleanup()
         return report
 
