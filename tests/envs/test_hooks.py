@@ -9,9 +9,8 @@ from support.control import IN_THE_AIR
 from support.settings import error_of, get_cfgs
 
 from legged_torque.envs import A1Cfg, A1CfgPPO, A1TorqueCfg, LeggedRobot, TorqueRobot
-from legged_torque.utils.config import section_keys
+from legged_torque.utils.config import section_keys, successors
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.successors import successors
 
 IDLE = {
     "_resample_commands": "generator",

@@ -10,8 +10,8 @@ from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors.config import by_joint
 from legged_torque.sim.randomization import RandomParameter
-from legged_torque.terrain import TERRAINS
-from legged_torque.terrain.terrain import Plane
+from legged_torque.terrain.rough import TERRAINS
+from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.mirroring import SCALAR
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -89,7 +89,7 @@ def test_parameters_that_do_not_fit(make, message):
     assert message in error_of(lambda: Robot(cfg).mirror)
 
 
-class Raised(Plane):
+class Raised(Terrain):
     """Ground that is 0.1 m higher for the task than in the physics."""
 
     def height_above(self, points):

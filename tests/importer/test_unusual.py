@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from support.urdf import urdf_of
 
-from legged_torque.importer.check import check
 from legged_torque.importer.mjcf import mjcf
-from legged_torque.importer.robot import import_robot
+from legged_torque.importer.robot import check, import_robot
 
 
 @pytest.fixture
