@@ -51,15 +51,7 @@ def module_name(file):
 
 
 def imports(tree, known):
-    """What a module imports of this repository, also inside of functions and for type checkers.
-
-    Args:
-        tree: The parsed module.
-        known: Names of all modules.
-
-    Returns:
-        (name of the module, line) of each import.
-    """
+    """Return (name, line) of each import of this repository, also inside of functions and for type checkers."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

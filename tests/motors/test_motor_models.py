@@ -188,10 +188,7 @@ def test_as_mujoco_s_dc_motor():
     [("drive", {"damping": 0.05}, 0.0), ("friction", {"viscous_friction": 0.03, "static_friction": 0.2}, 0.1)],
 )
 def test_energy_balance(model, constants, made):
-    """What the drive's damping and friction take from a turning body is what it loses, step by step, as MuJoCo counts.
-
-    A motor with friction is counted as making what was asked of it.
-    """
+    """What damping and friction take from a turning body is what it loses; motors make what was asked of them."""
     body = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0"><flag energy="enable"/></option><worldbody><body>'
         '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'

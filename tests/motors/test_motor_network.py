@@ -70,10 +70,7 @@ class Histories:
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_as_the_module(make_task, tmp_path, activation):
-    """In a position task, it sees the policy's targets, whatever gains a world has; episodes start without a past.
-
-    numpy has the same torques.
-    """
+    """It sees the policy's targets, whatever gains a world has, and no earlier episode; numpy has the same torques."""
     network = perceptron([6, 16, 8, 1], activation)
     options = {f"motors.network.{name}": value for name, value in SCALES.items()}
     options |= write(tmp_path / "net.json", network, activation)
