@@ -39,7 +39,7 @@ LINES = {
     "scripts": 1650,
     "paper": 3000,
     "tools": 700,
-    "tests": 22_010,
+    "tests": 21_661,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 29_680  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
@@ -51,15 +51,7 @@ def module_name(file):
 
 
 def imports(tree, known):
-    """What a module imports of this repository, also inside of functions and for type checkers.
-
-    Args:
-        tree: The parsed module.
-        known: Names of all modules.
-
-    Returns:
-        (name of the module, line) of each import.
-    """
+    """Return (name, line) of each import of this repository, also inside of functions and for type checkers."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

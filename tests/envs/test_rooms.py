@@ -75,6 +75,10 @@ def test_observation_terms_that_do_not_fit(term, message):
         ),
         (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
         (lambda task: RandomParameter("thigh_mass", "body_mass", [3, 6], {"scale": [0.5, 0.9]}), "'thigh_mass'"),
+        (
+            lambda task: RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]}),
+            "does not read 'dof_damping' of the trunk's free joint",
+        ),
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
