@@ -9,9 +9,8 @@ import pytest
 import yaml
 from support.motion import check_motion
 
-from legged_torque.importer.check import check
 from legged_torque.importer.mjcf import mjcf
-from legged_torque.importer.robot import import_robot
+from legged_torque.importer.robot import check, import_robot
 from legged_torque.utils.errors import UserError
 
 FILES = yaml.safe_load(Path(__file__).with_name("published.yaml").read_text("utf-8"))
