@@ -14,6 +14,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import Limits, Positive
+from legged_torque.utils.options import choose_motors
 
 
 def parse_args() -> argparse.Namespace:
@@ -21,7 +22,8 @@ def parse_args() -> argparse.Namespace:
     parser = cli.Parser(__doc__)
     parser.add_argument("log", type=Path, help="MCAP file of deploy.py --log")
     parser.add_argument("--policy", type=Path, required=True, help="policy.yaml, policy.onnx, or the folder of both")
-    parser.add_argument("--motors", default="ideal", help="of the simulated robot: ideal, real, ...; default: ideal")
+    hint = "of the simulated robot: ideal, real, ..., or a file of identify.py; default: ideal"
+    parser.add_argument("--motors", default="ideal", help=hint)
     parser.add_argument("--latency", type=float, default=0.0, help="of its commands [ms]; default: 0")
     parser.add_argument("--limit", type=float, default=0.1, help="gap at which they part [rad]; default: %(default)s")
     parser.add_argument("--plot", type=Path, help="figure of all joints; needs the extra 'plots'")
@@ -42,10 +44,10 @@ def main() -> None:
     log, policy = RecordedLog(args.log), Policy(args.policy)
     steps, equal = same_actions(log, policy)
     print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
-    motors = task_registry.get_cfgs(policy.description["task"])[0].motors
-    motors.choose(args.motors)
+    cfg = task_registry.get_cfgs(policy.description["task"])[0]
+    choose_motors(cfg, args.motors)
     xml, rate = resource_path(policy.description["robot"]["file"]), 1.0 / log.period
-    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=motors, latency=args.latency / 1e3))
+    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=args.latency / 1e3))
     parts = gap.parts_at(args.limit)
     until = min(parts.min(), gap.times[-1])
     print(f"joint: parts by {args.limit:g} rad at [s]; rms gap in the first {until:.2f} s [rad]")

@@ -20,6 +20,7 @@ from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, counted, printable
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
+from legged_torque.utils.options import choose_motors
 from legged_torque.utils.task_registry import LOGS
 
 
@@ -75,20 +76,23 @@ def main() -> None:
         from legged_torque.deploy.simulation import Simulation
         from legged_torque.utils.display import Counter
         from legged_torque.utils.metrics import UNITS, estimates, ratios
+        from legged_torque.utils.mjcf import set_joints
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
     args.policy = args.policy or last_export(Path(args.log_root or LOGS))
     policy = Policy(args.policy)
     if args.motors:
-        motors = task_registry.get_cfgs(policy.description["task"])[0].motors
-        motors.choose(args.motors)
-        policy.description["motors"] = motors.describe()
-        for name, armature in motors.armature(policy.joint_order).items():
-            policy.description["joints"][name]["armature"] = armature
+        cfg = task_registry.get_cfgs(policy.description["task"])[0]
+        choose_motors(cfg, args.motors)
+        policy.description["motors"] = cfg.motors.describe()
+        if any(cfg.motors.delay.range):
+            policy.description.setdefault("latency", {})["actions"] = cfg.motors.delay.described()
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])
     robot = MujocoRobot(xml, policy.description, args.contacts)
+    if args.motors:
+        set_joints(robot.model, cfg.motors.of_joints(policy.joint_order))
     simulation = Simulation(policy, robot, args.command, args.push_velocity, args.push_probability)
     notes = robot.notes + simulation.notes
     recorder = SimulationRecorder(simulation) if args.video else None

@@ -17,6 +17,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, NotNegative, Positive
+from legged_torque.utils.options import choose_motors
 
 RATE = 500.0  # messages per second, as a Go2
 TASKS = {"go2": "go2_position"}  # whose settings have the robot's file and motors
@@ -30,7 +31,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--interface", default="lo", help="network interface; default: %(default)s")
     parser.add_argument("--domain", type=int, default=1, help="of DDS; default: %(default)s, as unitree_mujoco")
     parser.add_argument("--seconds", type=float, help="end after this time; default: with Ctrl-C")
-    parser.add_argument("--motors", default="ideal", help="one of motors.choices: ideal, real, ...; default: ideal")
+    parser.add_argument("--motors", default="ideal", help="ideal, real, ..., or a file of identify.py; default: ideal")
     parser.add_argument("--latency", type=float, default=0.0, help="of commands [ms]; default: 0")
     hint = "lost, damaged (shares of messages), delay [s], silent=1; dead, hot or error=JOINT; may be repeated"
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
@@ -51,7 +52,7 @@ def main() -> None:
         from legged_torque.runtime.sim_robot import Faults, SimRobot
         from legged_torque.runtime.unitree_go2 import encode_state
     cfg, _ = task_registry.get_cfgs(TASKS[args.robot])
-    cfg.motors.choose(args.motors)
+    choose_motors(cfg, args.motors)
     side = Go2Side(args.interface, args.domain)
     motors = {"motors": cfg.motors, "latency": args.latency / 1e3}
     robot = SimRobot(resource_path(cfg.asset.file), side.joint_order, RATE, **motors)

@@ -202,6 +202,14 @@ MODELS = {cfg._model: cfg for cfg in _ALL}
 """Settings by the name of the model."""
 
 
+class JointsCfg(Section):
+    """What joints have besides motors, in place of what the robot's file says; None leaves that as it is."""
+
+    armature: PerJoint | None = None  # [kg m^2] of the rotors through their gears, in place of a curve's, too
+    damping: PerJoint | None = None  # [N m s/rad] viscous friction
+    frictionloss: PerJoint | None = None  # [N m] Coulomb friction
+
+
 class MotorsCfg(Section):
     """Named chains of links, and links that act only in a chain that lists them."""
 
@@ -214,6 +222,7 @@ class MotorsCfg(Section):
     quantize = QuantizeCfg  # steps of torques
     encoder = EncoderCfg  # steps of measurements, for policy, control law and the links before it
     network = NetworkCfg  # a network from logged data, in torch
+    joints = JointsCfg  # no link: inertia and friction of joints
 
     def choose(self, name: str) -> None:
         """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
@@ -221,14 +230,18 @@ class MotorsCfg(Section):
             raise unknown_name("motors", name, self.choices)
         self.chain = list(self.choices[name])
 
-    def armature(self, dof_names: Sequence[str]) -> dict[str, float]:
-        """Return the armatures of motors in the chain by joint [kg m^2], of several the last; none: the file's."""
-        found: dict[str, float] = {}
-        for name in self.chain:
-            values = getattr(getattr(self, name, None), "armature", None)
-            if values is not None:
-                found = dict(zip(dof_names, by_joint(f"motors.{name}.armature", values, dof_names), strict=True))
-        return found
+    def of_joints(self, dof_names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Return armature [kg m^2], damping [N m s/rad] and frictionloss [N m] by joint, where not those of the file.
+
+        An armature is that of :attr:`joints`, or of the last motor in the chain that has one.
+        """
+        of_chain = ((f"{name}.armature", getattr(getattr(self, name, None), "armature", None)) for name in self.chain)
+        settings = [*of_chain, *((f"joints.{name}", value) for name, value in to_dict(self.joints).items())]
+        return {
+            path.rpartition(".")[2]: dict(zip(dof_names, by_joint(f"motors.{path}", value, dof_names), strict=True))
+            for path, value in settings
+            if value is not None
+        }
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""

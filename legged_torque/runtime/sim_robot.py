@@ -12,7 +12,7 @@ from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import loading
+from legged_torque.utils.mjcf import loading, set_joints
 
 WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
@@ -80,9 +80,7 @@ class SimRobot:
         self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
         self._steps = round(1.0 / (rate * STEP))
         self._drives = MotorTwin(self._description(motors))
-        armatures = motors.armature(joint_order) if motors else {}
-        for name, armature in armatures.items():
-            self.model.dof_armature[self.model.joint(name).dofadr[0]] = armature
+        set_joints(self.model, motors.of_joints(joint_order) if motors else {})
         self._latency, self._on_their_way = latency, deque[tuple[float, MotorCommand]]()
         self._rng, self.faults = np.random.default_rng(seed), Faults()
         self.watchdog_ticks, self.excess, self.is_damping = 0, 0.0, True

@@ -3,7 +3,7 @@
 import contextlib
 import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -156,6 +156,15 @@ def robot_notes(file: Path, trained: Path) -> Iterator[str]:
 def joint_limits(model: mujoco.MjModel) -> np.ndarray:
     """Return lowest and highest position of each joint, infinite without a range. Shape: (njnt, 2) [rad]."""
     return np.where(model.jnt_limited[:, np.newaxis] > 0, model.jnt_range, [-np.inf, np.inf])
+
+
+def set_joints(model: mujoco.MjModel, values: Mapping[str, Mapping[str, float]]) -> None:
+    """Give joints other armatures [kg m^2], dampings [N m s/rad] or friction losses [N m], by field and name."""
+    for field, of_joints in values.items():
+        for name, value in of_joints.items():
+            getattr(model, f"dof_{field}")[model.joint(name).dofadr[0]] = value
+    if values:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:

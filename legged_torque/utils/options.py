@@ -2,15 +2,19 @@
 
 import copy
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.config import section_keys, set_by_path, successor, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value, types_of
+from legged_torque.utils.plain_yaml import parse_yaml
 
 DEFAULT_PRESET = "parallel"
 CPU_PRESET = "laptop"  # chosen where there is no GPU
 DEFAULT_TASK = "a1_torque_multihead"
+MOTOR_FILES = (".yaml", ".yml")
+OF_MOTORS = ("motors", "domain_rand")  # sections that such files may have
 
 
 def _option(text: str, default: Any = None, **how: Any) -> Any:
@@ -47,8 +51,8 @@ class Options:
         "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
     )
     motors: str | None = _option(
-        "models of the motors: ideal, real, or another of the robot's motors.choices; default: those of the task, or "
-        "what a loaded run has"
+        "models of the motors: ideal, real, or another of the robot's motors.choices, or a YAML file of identify.py; "
+        "default: those of the task, or what a loaded run has"
     )
     policy_hz: Rate | None = _option("control steps per second; default: 50, or those of the task or the loaded run")
     physics_hz: Rate | None = _option("physics steps per second; default: 200, or those of the task or the loaded run")
@@ -100,7 +104,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     if options.ranges:
         update_from_dict(env_cfg, _named("ranges", options.ranges, env_cfg.parameter_ranges()))
     if options.motors:
-        env_cfg.motors.choose(options.motors)
+        choose_motors(env_cfg, options.motors)
     paths = ("env.num_envs", "seed", "runner.experiment_name", "runner.run_name", "runner.logger")
     changes = [(path, value) for path in paths if (value := getattr(options, path.rpartition(".")[2])) is not None]
     for item in options.set:
@@ -117,6 +121,26 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
             raise unknown_name("config section", section, sections)
         set_by_path(sections[section], path, value)
     train_cfg.refuse_unread(path for path, _ in changes)
+
+
+def choose_motors(env_cfg: Any, name: str) -> None:
+    """Choose a chain of motors by its name, or take settings of motors and of what is drawn at random from a YAML file.
+
+    A UserError if there is no such chain or file, or the file holds anything else.
+    """
+    if not name.endswith(MOTOR_FILES):
+        env_cfg.motors.choose(name)
+        return
+    try:
+        values = parse_yaml(Path(name).read_text("utf-8"), f"'{name}'")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"cannot read the settings of motors in '{name}': {error}") from None
+    if not isinstance(values, dict):
+        raise UserError(f"'{name}' must hold the sections {' and '.join(OF_MOTORS)}")
+    for section in values:
+        if section not in OF_MOTORS:
+            raise unknown_name(f"section of '{name}'", str(section), OF_MOTORS)
+    update_from_dict(env_cfg, values)
 
 
 def apply_perturbation(env_cfg: Any, name: str) -> None:

@@ -277,7 +277,7 @@ def test_armature():
     rotors = 2 * [0.01018, 0.0251, 0.01018, 0.0251, 2 * 0.00361, 2 * 0.00361]
     np.testing.assert_allclose(inertia["real"] - inertia["ideal"], rotors, atol=1e-9)
     cfg = task_registry.get_cfgs("go2_torque", Options(device="cpu", motors="real"))[0]
-    assert cfg.motors.armature(list(cfg.init_state.default_joint_angles)) == {}
+    assert cfg.motors.of_joints(list(cfg.init_state.default_joint_angles)) == {}
 
 
 @pytest.mark.parametrize(("model", "constants", "words"), TABLES["refused"])

@@ -22,6 +22,7 @@ from legged_torque.utils.mjcf import (
     loading,
     read_spec,
     self_pairs,
+    set_joints,
 )
 
 
@@ -88,12 +89,11 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
         problems += floor_problems(model, [geoms[place] for place in chosen[0]])
     refuse(problems, f"'{settings.file}' cannot be simulated")
     use_plain_motors(spec, model)
-    motors: Any = cfg.motors
-    for name, armature in motors.armature(dof_names).items():
-        spec.joint(name).armature = armature
     _choose_self_collisions(settings, spec, model, notes)
     with loading(file):
         model = spec.compile()
+    motors: Any = cfg.motors
+    set_joints(model, motors.of_joints(dof_names))
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
     notes += foot_notes(model, [geoms[place] for place in feet])
