@@ -61,6 +61,7 @@ class Controller:
         self.state: RobotState | None = None
         self.velocity_command = np.zeros(3)
         self._since, self._state_time, self._now, self._missed, self._damaged = 0.0, -np.inf, 0.0, 0, 0
+        self._problems: list[str] = []  # of the last look
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
         self.sent, self._lock = self._gentle(0.0), threading.Lock()
         self.policy_step: PolicyStep | None = None
@@ -107,7 +108,7 @@ class Controller:
             stands = self.mode == Mode.STAND and self._now - self._since >= self.brakes.stand_up
             if mode == Mode.POLICY and not stands:
                 return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
-            if mode == Mode.STAND and (problem := self._fault(Received())):
+            if mode == Mode.STAND and (problem := self._fault()):
                 return problem
             self._enter(mode)
             self.reason = ""
@@ -152,7 +153,8 @@ class Controller:
         if isinstance(received.newest, RobotState):
             self.state, self._state_time, self._damaged = received.newest, now, 0
         self._damaged += received.wrong_crc
-        if problem := self._fault(received):
+        self._problems = received.problems
+        if problem := self._fault():
             self.stop(problem)
         if self.mode in (Mode.STAND, Mode.POLICY) and self.state is not None:
             return self._moving(self.state)
@@ -167,13 +169,13 @@ class Controller:
         before = np.clip(torques_of(self.sent, state), *self.joints.torque_limits)
         return limited(command, state, before, self.brakes.torque_rate * self.period, self.joints)
 
-    def _fault(self, received: Received) -> str:
+    def _fault(self) -> str:
         """Return why the robot must not move."""
         if self.state is None:
             return "the robot has not said anything yet"
         if self._missed > self.brakes.max_missed:
             return f"{self._missed} deadlines were missed in a row"
-        seen = Received(None, self._damaged, problems=received.problems)
+        seen = Received(None, self._damaged, problems=self._problems)
         return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)
 
     def _gentle(self, damping: float) -> MotorCommand:

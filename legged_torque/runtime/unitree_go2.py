@@ -16,16 +16,13 @@ from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
 from numpy.typing import ArrayLike
 
-from legged_torque.runtime.interface import MotorCommand, RobotState
+from legged_torque.runtime.interface import JOINT_ORDER, NO_POSITION, NO_VELOCITY, MotorCommand, RobotState
 
-JOINT_ORDER = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
 SLOTS = 20  # motors in a message; those after the legs' 12 are idle
 HEAD = (0xFE, 0xEF)
 UNSET = (0, 0)  # unitree_mujoco sets neither the head nor the modes of its states
 LOW_LEVEL = 0xFF
 SERVO = 0x01  # mode of a motor
-NO_POSITION = 2.146e9  # as q: the drive holds no position
-NO_VELOCITY = 16000.0  # as dq: the drive damps nothing
 COMMANDED = ("tau", "q", "dq", "kp", "kd")
 MEASURED = {
     "joint_positions": "q",

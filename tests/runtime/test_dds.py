@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_t
 from legged_torque.runtime import unitree_go2 as go2
 from legged_torque.runtime.dds import Go2Robot, Go2Side
 from legged_torque.runtime.interface import MotorCommand
+from legged_torque.runtime.motion_switcher import Release, SportMode
 from legged_torque.utils.errors import UserError
 
 DOMAIN = 100 + os.getpid() % 100  # each worker of pytest has its own
@@ -61,12 +63,12 @@ class Robot:
         return looks(transport, 0.2)
 
     def meet(self, transport):
-        """Wait until both sides have found each other, with messages that have no number: it is 0."""
+        """Wait until both sides have found each other, with messages of number 0, and the sport mode is released."""
         for _ in range(200):
             self.tell([0])
             transport.publish(numbered(0))
             found, heard = looks(transport, 0.03), self.heard()
-            if heard[0] == 0 and any(look.newest for look in found):
+            if heard[0] == 0 and any(look.newest for look in found) and not found[-1].problems:
                 return
         pytest.fail("the two sides have not met")
 
@@ -172,6 +174,68 @@ def test_commands_are_numbered(robot, transport):
     time.sleep(0.2)
     robot.tell([])
     assert robot.heard() == [5, 0, 0, 0, 0]
+
+
+def test_the_sport_mode_is_released_first(transport):
+    """Before, the robot refuses commands, even of others, and none is sent; a robot that starts anew is asked anew."""
+    for _ in range(2):
+        with started() as robot:
+            for _ in range(200):  # until they have found each other
+                transport.publish(numbered(7))
+                robot.tell([0])
+                torque, *_, problems = robot.heard()
+                if problems:
+                    break
+            assert np.isnan(torque) and problems
+            sent = []
+            transport.publish, publish = sent.append, transport.publish
+            found = looks(transport, 0.05)
+            assert any("does not answer" in look.problems[0] for look in found if look.newest)
+            transport.send(torques(1.0))
+            assert not sent
+            transport.publish = publish
+            robot.meet(transport)
+            transport.send(torques(2.0))
+            time.sleep(0.2)
+            robot.tell([])
+            assert robot.heard()[0] == 2.0
+
+
+def test_answers_of_the_motion_switcher():
+    """A mode is released, an error and an answer of another kind are problems, and a simulator may have no service."""
+    sent, service = [], SportMode()
+    release = Release(sent.append, is_optional=False)
+    release.look([], 0.0)
+    release.look([service.answer(sent[0])], 0.1)
+    assert "'normal'" in release.problem and [each.header.identity.api_id for each in sent] == [1001, 1003]
+    stale = service.answer(sent[0])
+    release.look([service.answer(sent[1]), stale], 0.2)
+    release.look([], 0.35)
+    assert "'normal'" in release.problem and len(sent) == 3
+    release.look([service.answer(sent[2])], 0.36)
+    assert not release.problem and not service.name
+    for code, data, said in ((3104, "", "error 3104"), (0, "{", "'{'"), (0, '{"form": 0}', "form")):
+        release.begin()
+        release.look([], 1.0)
+        response = service.answer(sent[-1])
+        response.header.status.code, response.data = code, data
+        release.look([response], 1.1)
+        assert said in release.problem
+    for is_optional in (True, False):
+        release = Release(sent.append, is_optional)
+        for now in (5.0, 6.9, 7.1):
+            release.look([], now)
+            assert bool(release.problem) == (now < 7.0 or not is_optional)
+
+
+def test_bytes_of_a_request():
+    """They are the CDR of unitree_api's structures: 64-bit numbers, a string with its length and end, a sequence."""
+    sent = []
+    Release(sent.append, is_optional=False).look([], 0.0)
+    data = sent[0].serialize()
+    expected = struct.pack("<4xqqqi?3xI3sxI", sent[0].header.identity.id, 1001, 0, 0, False, 3, b"{}", 0)
+    assert data[4 : len(expected)] == expected[4:] and data[:2] == b"\x00\x01"
+    assert SportMode().answer(sent[0]).serialize()[4:20] == data[4:20]
 
 
 def test_robots_that_start_anew_and_two_at_once(transport):
