@@ -148,9 +148,9 @@ def _check_schema(description: Any, where: str) -> None:
         raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
 
 
-def require(*packages: str) -> None:
+def require(*packages: str, extra: str = "export") -> None:
     """Raise a UserError that names the extra if a package is not installed."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            extra = "pip install 'legged_torque[export]'"
-            raise UserError(f"{package} is not installed; exported policies need the extra: {extra}")
+            line = f"pip install 'legged_torque[{extra}]'"
+            raise UserError(f"{package} is not installed; exported policies need the extra: {line}")

@@ -5,7 +5,7 @@ import hashlib
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,12 @@ def nominal_cfg(cfg: Any) -> Any:
 
 
 def export_policy(
-    task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]
+    task: LeggedRobot,
+    model: MLPModel,
+    folder: Path,
+    name: str,
+    training: dict[str, Any],
+    add: Callable[[Path, torch.nn.Module], None] | None = None,
 ) -> tuple[float, list[str]]:
     """Write a policy with everything that is needed to run it, and check the files.
 
@@ -83,6 +88,7 @@ def export_policy(
         folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
         name: Name of the task.
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
+        add: Adds files of another format to an export, for its folder and network.
 
     Returns:
         Largest difference between the exported networks and the model, and what is unsupported.
@@ -101,9 +107,12 @@ def export_policy(
         difference = write_networks(model, part, description)
         description["unsupported"] = unknown_parts(task, description) or differences(task, model, Policy(part))
         write_description(part, description)
-        folder.mkdir(exist_ok=True)
-        for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
-            os.replace(part / file, folder / file)
+        if add:
+            add(part, model.as_onnx(verbose=False).cpu().eval())
+        for file in sorted(part.rglob("*.*"), key=lambda file: file.name == DESCRIPTION_FILE):
+            target = folder / file.relative_to(part)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, target)
     return difference, description["unsupported"]
 
 

@@ -152,6 +152,21 @@ class Policy:
             total += np.float32(term["mixing_weight"]) * torques
         return total
 
+    def drive_targets(self, actions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return tau, q, kp and kd of drives that make tau + kp (q - position) - kd velocity. Shapes: (joints,).
+
+        That is :meth:`wanted_torques` of actions, for the terms position_residual and torque.
+        """
+        q = self.nominal_pose.astype(float)
+        tau, kp, kd = np.zeros((3, len(q)))
+        for term, values in zip(self._action_terms, actions.reshape(-1, len(q)), strict=True):
+            if term["name"] == "torque":
+                tau = term["mixing_weight"] * term["scale"] * values.astype(float)
+            else:
+                q = self.nominal_pose + term["scale"] * values.astype(float)
+                kp, kd = (term["mixing_weight"] * gain for gain in (self.stiffness, self.damping))
+        return tau, q, kp, kd
+
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
         """Return x and y of the points of the height scan in the world, in which the trunk has a pose [m].
 
@@ -236,18 +251,14 @@ def run_network(session: Any, obs: np.ndarray, memory: dict[str, np.ndarray]) ->
     return actions
 
 
-def _sizes(memory: dict[str, Any]) -> list[int]:
-    """Return layers and size of what a network remembers."""
-    return [memory["layers"], memory["size"]]
-
-
 def load_network(file: Path, description: dict[str, Any]) -> Any:
     """Return the network's session; a UserError that names what differs if it is not the network of a description."""
     (session, checksum), network = open_network(file), description["network"]
-    nodes, memory = (*session.get_inputs(), *session.get_outputs()), network.get("memory", [])
+    nodes = (*session.get_inputs(), *session.get_outputs())
+    memory = [(each["input"], each["output"], [each["layers"], each["size"]]) for each in network.get("memory", [])]
     ends = [(node.name, [size for size in node.shape if isinstance(size, int)]) for node in nodes]  # but for the robots
-    expected = [("obs", [network["num_observations"]]), *((each["input"], _sizes(each)) for each in memory)]
-    expected += [("actions", [network["num_actions"]]), *((each["output"], _sizes(each)) for each in memory)]
+    expected = [("obs", [network["num_observations"]]), *((name, size) for name, _, size in memory)]
+    expected += [("actions", [network["num_actions"]]), *((name, size) for _, name, size in memory)]
     if ends != expected:
         raise UserError(f"'{file}' has the input and output {ends}, not {expected}")
     if checksum != network["sha256"]:
