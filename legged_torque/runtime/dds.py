@@ -39,10 +39,10 @@ WRITER = Qos(
 def configuration(interface: str) -> str:
     """Return Cyclone DDS's settings for one network interface; loopback is searched without multicast."""
     network = f"<NetworkInterface name={quoteattr(interface)}"
-    if interface != "lo":
-        return f"<CycloneDDS><Domain><General><Interfaces>{network}/></Interfaces></General></Domain></CycloneDDS>"
-    general = f"<Interfaces>{network} multicast='false'/></Interfaces><AllowMulticast>false</AllowMulticast>"
-    discovery = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
+    general, discovery = f"<Interfaces>{network}/></Interfaces>", ""
+    if interface == "lo":
+        general = f"<Interfaces>{network} multicast='false'/></Interfaces><AllowMulticast>false</AllowMulticast>"
+        discovery = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
     domain = f"<General>{general}</General><Discovery>{discovery}</Discovery>"
     return f"<CycloneDDS><Domain>{domain}</Domain></CycloneDDS>"
 
@@ -76,16 +76,15 @@ class _Side:
         try:
             self._domain = Domain(domain, configuration(interface))
             self._participant = DomainParticipant(domain)
-            self._writer, self._service_writer = (DataWriter(*self._topic(kind), WRITER) for kind in self.writes)
-            self._reader, self._service_reader = (DataReader(*self._topic(kind), READER) for kind in self.reads)
+            here = self._participant
+            topics = {kind: Topic(here, TOPICS[kind], kind) for kind in (*self.writes, *self.reads)}
+            self._writer, self._service_writer = (DataWriter(here, topics[kind], WRITER) for kind in self.writes)
+            self._reader, self._service_reader = (DataReader(here, topics[kind], READER) for kind in self.reads)
         except DDSException as error:
             rule = "the interface must be up, the domain from 0 to 232, and used once in this process"
             raise UserError(f"no DDS on interface '{interface}' in domain {domain}: {rule} ({error.msg})") from None
         self._senders: list[int] = []  # of messages so far, the last one at the end
         self._newest = 0
-
-    def _topic(self, kind: type) -> tuple[DomainParticipant, Topic]:
-        return self._participant, Topic(self._participant, TOPICS[kind], kind)
 
     def receive(self) -> Received:
         """Return what has come since the last call: at most the newest DEPTH messages, those before are lost.
@@ -153,7 +152,8 @@ class Go2Robot(_Side):
         sender, received = self._senders[-1:], super().receive()
         if self._senders[-1:] != sender:
             self._release.begin()
-        self._release.look(_taken(self._service_reader), time.monotonic())
+        if self._release.problem:
+            self._release.look(_taken(self._service_reader), time.monotonic())
         received.problems += filter(None, [self._release.problem])
         return received
 

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import int32, int64, sequence, uint8
 
 CHECK_MODE, RELEASE_MODE = 1001, 1003
-NOT_IMPLEMENTED = 3203  # code of an answer
 AGAIN = 0.2  # seconds between two requests
 ABSENT = 2.0  # seconds without an answer after which a robot that need not have the service has none
 
@@ -32,7 +32,6 @@ Status_ = _struct("ResponseStatus_", code=int32)
 ResponseHeader_ = _struct("ResponseHeader_", identity=Identity_, status=Status_)
 Response_ = _struct("Response_", header=ResponseHeader_, data=str, binary=sequence[uint8])
 SERVICE = {Request_: "rt/api/motion_switcher/request", Response_: "rt/api/motion_switcher/response"}
-"""Topics by type."""
 
 
 class Release:
@@ -49,33 +48,31 @@ class Release:
 
     def begin(self) -> None:
         """Ask anew, as a robot may have been switched on again."""
-        self.problem, self._begin, self._next, self._number = "the motion switcher does not answer", 0.0, 0.0, 0
-        self._is_silent = self._is_optional
+        self.problem, self._number, self._next, self._absent_at = "the motion switcher does not answer", 0, 0.0, np.inf
 
     def look(self, responses: list[Any], now: float) -> None:
-        """Take answers, and ask for what is missing, at a time [s]."""
-        self._begin = self._begin or now
+        """Take answers, and ask for what is missing, at a time [s]. An answer that cannot be read is a mode."""
+        if not self._number and self._is_optional:
+            self._absent_at = now + ABSENT
         for response in responses:
-            if response.header.identity.id == self._number:
-                self._is_silent = False
-                self._take(response, now)
-        if self._is_silent and now - self._begin > ABSENT:
+            identity, code = response.header.identity, response.header.status.code
+            if identity.id != self._number:
+                continue
+            self._absent_at = np.inf
+            if code:
+                self.problem = f"the motion switcher answers with error {code}"
+            elif identity.api_id == CHECK_MODE:
+                try:
+                    mode = json.loads(response.data)["name"]
+                except (ValueError, KeyError, TypeError):
+                    mode = response.data
+                self.problem = f"the sport mode '{mode}' holds the motors" if mode else ""
+                if mode:
+                    self._ask(RELEASE_MODE, now)
+        if now > self._absent_at:
             self.problem = ""
         if self.problem and now >= self._next:
             self._ask(CHECK_MODE, now)
-
-    def _take(self, response: Any, now: float) -> None:
-        """Conclude from an answer whether a mode holds the motors; one that cannot be read is a mode."""
-        if response.header.status.code:
-            self.problem = f"the motion switcher answers with error {response.header.status.code}"
-        elif response.header.identity.api_id == CHECK_MODE:
-            try:
-                mode = json.loads(response.data)["name"]
-            except (ValueError, KeyError, TypeError):
-                mode = response.data
-            self.problem = f"the sport mode '{mode}' holds the motors" if mode else ""
-            if mode:
-                self._ask(RELEASE_MODE, now)
 
     def _ask(self, api: int, now: float) -> None:
         """Send a request."""
@@ -84,18 +81,14 @@ class Release:
 
 
 class SportMode:
-    """The end of a simulated robot, whose sport mode holds the motors until it is released.
+    """The end of a simulated robot, whose sport mode holds the motors until it is released."""
 
-    Attributes:
-        name: Of the mode; empty once it is released.
-    """
-
-    name = "normal"
+    name = "normal"  # empty once it is released
 
     def answer(self, request: Any) -> Any:
         """Do what a request asks for, and return the response."""
         api = request.header.identity.api_id
         self.name = "" if api == RELEASE_MODE else self.name
         data = json.dumps({"form": "0", "name": self.name}) if api == CHECK_MODE else ""
-        status = Status_(0 if api in (CHECK_MODE, RELEASE_MODE) else NOT_IMPLEMENTED)
+        status = Status_(0 if api in (CHECK_MODE, RELEASE_MODE) else 3203)  # not implemented
         return Response_(ResponseHeader_(request.header.identity, status), data, [])

@@ -176,24 +176,21 @@ def test_commands_are_numbered(robot, transport):
     assert robot.heard() == [5, 0, 0, 0, 0]
 
 
-def test_the_sport_mode_is_released_first(transport):
-    """Before, the robot refuses commands, even of others, and none is sent; a robot that starts anew is asked anew."""
+def test_the_sport_mode_is_released_first(transport, monkeypatch):
+    """Before, a robot refuses commands, and none is sent; a robot that starts anew is asked anew."""
     for _ in range(2):
         with started() as robot:
+            heard = [np.nan, 0, 0, 0, 0]
             for _ in range(200):  # until they have found each other
-                transport.publish(numbered(7))
-                robot.tell([0])
-                torque, *_, problems = robot.heard()
-                if problems:
-                    break
-            assert np.isnan(torque) and problems
-            sent = []
-            transport.publish, publish = sent.append, transport.publish
-            found = looks(transport, 0.05)
-            assert any("does not answer" in look.problems[0] for look in found if look.newest)
-            transport.send(torques(1.0))
-            assert not sent
-            transport.publish = publish
+                if not heard[4]:
+                    transport.publish(numbered(7))
+                    robot.tell([0])
+                    heard = robot.heard()
+            assert np.isnan(heard[0]) and heard[4]
+            with monkeypatch.context() as patch:
+                patch.setattr(transport, "publish", lambda message: pytest.fail("a command is sent"))
+                assert any("does not answer" in look.problems[0] for look in looks(transport, 0.05) if look.newest)
+                transport.send(torques(1.0))
             robot.meet(transport)
             transport.send(torques(2.0))
             time.sleep(0.2)
@@ -202,18 +199,18 @@ def test_the_sport_mode_is_released_first(transport):
 
 
 def test_answers_of_the_motion_switcher():
-    """A mode is released, an error and an answer of another kind are problems, and a simulator may have no service."""
+    """A mode is released; stale answers, errors and those that cannot be read release nothing. Requests are CDR."""
     sent, service = [], SportMode()
     release = Release(sent.append, is_optional=False)
-    release.look([], 0.0)
-    release.look([service.answer(sent[0])], 0.1)
-    assert "'normal'" in release.problem and [each.header.identity.api_id for each in sent] == [1001, 1003]
-    stale = service.answer(sent[0])
-    release.look([service.answer(sent[1]), stale], 0.2)
-    release.look([], 0.35)
-    assert "'normal'" in release.problem and len(sent) == 3
-    release.look([service.answer(sent[2])], 0.36)
-    assert not release.problem and not service.name
+    for now, answered, problem, count in (
+        (0.0, [], "the motion switcher does not answer", 1),
+        (0.1, [0], "the sport mode 'normal' holds the motors", 2),
+        (0.2, [1, 0], "the sport mode 'normal' holds the motors", 2),
+        (0.35, [], "the sport mode 'normal' holds the motors", 3),
+        (0.4, [2], "", 3),
+    ):
+        release.look([service.answer(sent[i]) for i in answered], now)
+        assert (release.problem, len(sent)) == (problem, count)
     for code, data, said in ((3104, "", "error 3104"), (0, "{", "'{'"), (0, '{"form": 0}', "form")):
         release.begin()
         release.look([], 1.0)
@@ -221,21 +218,13 @@ def test_answers_of_the_motion_switcher():
         response.header.status.code, response.data = code, data
         release.look([response], 1.1)
         assert said in release.problem
-    for is_optional in (True, False):
+    for is_optional in (True, False):  # of a simulator without the service
         release = Release(sent.append, is_optional)
         for now in (5.0, 6.9, 7.1):
             release.look([], now)
             assert bool(release.problem) == (now < 7.0 or not is_optional)
-
-
-def test_bytes_of_a_request():
-    """They are the CDR of unitree_api's structures: 64-bit numbers, a string with its length and end, a sequence."""
-    sent = []
-    Release(sent.append, is_optional=False).look([], 0.0)
-    data = sent[0].serialize()
-    expected = struct.pack("<4xqqqi?3xI3sxI", sent[0].header.identity.id, 1001, 0, 0, False, 3, b"{}", 0)
-    assert data[4 : len(expected)] == expected[4:] and data[:2] == b"\x00\x01"
-    assert SportMode().answer(sent[0]).serialize()[4:20] == data[4:20]
+    number = sent[0].header.identity.id  # two of 64 bits, one for the lease, priority, a flag; text; an empty sequence
+    assert sent[0].serialize()[4:] == struct.pack("<qqqi?3xI3sxI", number, 1001, 0, 0, False, 3, b"{}", 0)
 
 
 def test_robots_that_start_anew_and_two_at_once(transport):
