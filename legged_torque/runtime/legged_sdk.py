@@ -31,9 +31,8 @@ class LeggedSdkRobot:
             raise UserError(f"A1 and Go1 need robot_interface of unitree_legged_sdk in PYTHONPATH ({error})") from None
         self._udp = sdk.UDP(LOW_LEVEL, LOCAL_PORT, *ROBOT)
         self._safety, self._power = sdk.Safety(getattr(sdk.LeggedType, KINDS[robot])), power
-        self._command, self._state = sdk.LowCmd(), sdk.LowState()
+        self._command, self._state, self._tick = sdk.LowCmd(), sdk.LowState(), 0
         self._udp.InitCmdData(self._command)
-        self._tick = 0
 
     def receive(self) -> Received:
         """Return the newest state, if there is one whose ``tick`` is new."""

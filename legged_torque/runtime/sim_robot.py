@@ -74,7 +74,8 @@ class SimRobot:
         self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
         self._steps = round(1.0 / (rate * STEP))
         self._drives = MotorTwin(self._description(motors))
-        for name, armature in (motors.armature(joint_order) if motors else {}).items():
+        armatures = motors.armature(joint_order) if motors else {}
+        for name, armature in armatures.items():
             self.model.dof_armature[self.model.joint(name).dofadr[0]] = armature
         self._latency, self._on_their_way = latency, deque[tuple[float, MotorCommand]]()
         self._rng, self.faults = np.random.default_rng(0), Faults()
