@@ -43,8 +43,11 @@ def parse_args() -> argparse.Namespace:
     )
     parser.add_argument("--seconds", type=float, help="end after this time; default: when asked to")
     parser.add_argument("--walk", action="store_true", help="stand up and walk without being asked; simulation only")
+    hint = "in place of the policy, move all joints of a robot that hangs in the air, for identify.py; default: 40 s"
+    parser.add_argument("--chirp", type=float, nargs="?", const=40.0, metavar="SECONDS", help=hint)
     parser.add_argument("--log", type=Path, help="new MCAP file for every tick; replay.py reads it")
     args = parser.parse_args()
+    cli.check_args(args, chirp=Annotated[float, Limits(10, 120)])
     cli.check_args(args, rate=Rate, seconds=Positive, command=list[float], domain=Annotated[int, Limits(0, 232)])
     if args.walk and args.interface not in ("sim", "lo"):
         raise UserError("--walk is for simulated robots (--interface sim or lo): a real one waits for its operator")
@@ -60,7 +63,7 @@ def main() -> None:
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.operator import Operator
         from legged_torque.runtime.session import Session
-    policy = Policy(args.policy)
+    policy = chirp(args, Policy(args.policy)) if args.chirp else Policy(args.policy)
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
     session = Session(controller, transport, new_log(args.log, controller) if args.log else None)
@@ -71,6 +74,8 @@ def main() -> None:
         with StopRequest(lambda text: None) as stop, RealTimeLoop(args.rate, session.tick) as loop, operator:
             next_line = time.monotonic()
             while not stop.requested and not operator.has_ended and time.monotonic() < end and loop.error is None:
+                if args.chirp and policy.has_ended:
+                    break
                 operator.look()
                 if session.log:
                     session.log.write()
@@ -94,6 +99,15 @@ def new_log(file: Path, controller: Any) -> Any:
     return Log(file, controller)
 
 
+def chirp(args: argparse.Namespace, policy: Any) -> Any:
+    """Return sweeps in place of a policy, once the operator has said that the robot hangs; with sim it does."""
+    from legged_torque.runtime.chirp import Chirp, confirm
+
+    if args.interface != "sim":
+        confirm()
+    return Chirp(policy, args.rate, args.chirp)
+
+
 def connect(args: argparse.Namespace, policy: Any) -> Any:
     """Return the transport to the robot."""
     if args.interface == "sim":
@@ -101,7 +115,7 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
         from legged_torque.runtime.sim_robot import SimRobot
 
         xml = resource_path(policy.description["robot"]["file"])
-        return InProcess(SimRobot(xml, policy.joint_order, args.rate))
+        return InProcess(SimRobot(xml, policy.joint_order, args.rate, hangs=bool(args.chirp)))
     from legged_torque.runtime.dds import Go2Robot
 
     if (trained := policy.description["robot"]["name"]) != ROBOT:
