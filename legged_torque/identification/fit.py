@@ -74,10 +74,8 @@ class Problem:
         self._ticks = round((1.0 - HELD_OUT) * len(recording.commands))
         self._high = np.array([*np.outer(LARGEST, limits).flat, *[BIAS] * len(names), DELAY])
         self._low = np.array([*1e-3 * LARGEST[0] * limits, *[0.0] * 2 * len(names), *[-BIAS] * len(names), -STEP])
-        self._range, self._names = (
-            self._high - self._low,
-            [f"{kind} of {name}" for kind in PARAMETERS for name in names],
-        )
+        self._range = self._high - self._low
+        self._names = [*(f"{kind} of {name}" for kind in PARAMETERS[:4] for name in names), PARAMETERS[4]]
         own = [[kind * len(names) + joint for kind in range(4) for joint in leg] + [last] for leg in robots.branches]
         self._legs = list(zip(robots.branches, own, strict=True))  # joints and numbers of each
         places = range(max(map(len, own)) - 1)
