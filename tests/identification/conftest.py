@@ -20,21 +20,35 @@ TILT = np.array([0.98, 0.1, -0.15, 0.08]) / np.linalg.norm([0.98, 0.1, -0.15, 0.
 POSE = {"FR_hip_joint": -0.1, "FR_thigh_joint": 0.8, "FR_calf_joint": -1.5}
 TRUTH = np.array([[0.015, 0.024, 0.008], [0.19, 0.08, 0.1], [0.34, 0.19, 0.24], [-0.047, 0.055, 0.04], [0.005] * 3])
 """Armature, viscous and Coulomb friction, bias and delay of the joints."""
+NUMBERS = np.append(TRUTH[:4].ravel(), TRUTH[4, 0])
 
 
 @pytest.fixture(scope="session")
 def leg(tmp_path_factory):
-    """Settings of a task whose robot has one leg."""
+    """Settings of a task whose robot has one leg; beside its file, ``fixed.xml`` has the known numbers."""
     cfg = task_registry.get_cfgs("go2_torque")[0]
-    tree = ElementTree.parse(resource_path(cfg.asset.file))
-    for owner in (tree.find("worldbody/body"), tree.find("actuator"), tree.getroot()):
+    tree, folder = ElementTree.parse(resource_path(cfg.asset.file)), tmp_path_factory.mktemp("leg")
+    trunk = tree.find("worldbody/body")
+    for owner in (trunk, tree.find("actuator"), tree.getroot()):
         for part in [*owner.findall("body"), *owner.findall("motor"), *owner.findall("keyframe")]:
             if not part.get("name", "").startswith("FR"):
                 owner.remove(part)
-    cfg.asset.file = str(tmp_path_factory.mktemp("leg") / "leg.xml")
-    tree.write(cfg.asset.file)
-    cfg.asset.mirrored_legs, cfg.init_state.default_joint_angles = [], dict(POSE)
+    tree.write(folder / "leg.xml")
+    cfg.asset.file, cfg.asset.mirrored_legs = str(folder / "leg.xml"), []
+    cfg.init_state.default_joint_angles = dict(POSE)
+    trunk.set("quat", " ".join(map(str, TILT)))
+    trunk.remove(trunk.find("freejoint"))
+    for joint, numbers in zip(trunk.iter("joint"), TRUTH.T, strict=True):
+        joint.attrib |= dict(zip(("armature", "damping", "frictionloss"), map(str, numbers), strict=False))
+    tree.write(folder / "fixed.xml")
     return cfg
+
+
+def fixed(leg, step):
+    """The specification of the leg on a fixed trunk, which touches nothing."""
+    spec = mujoco.MjSpec.from_file(leg.asset.file.replace("leg.xml", "fixed.xml"))
+    spec.option.timestep, spec.option.disableflags = step, mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return spec
 
 
 def sweep(seconds, last=10.0, amplitude=0.25):
@@ -52,14 +66,7 @@ def record(leg, targets, step=1e-4, half=0.0):
 
     With a ``half``, as it should be, they know velocities that much ahead, and get commands that much later, in steps.
     """
-    spec = mujoco.MjSpec.from_file(leg.asset.file)
-    spec.body("trunk").quat, spec.option.timestep = TILT, step
-    spec.delete(next(joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE))
-    model = spec.compile()
-    model.geom_contype[:] = model.geom_conaffinity[:] = 0
-    model.dof_armature[:], model.dof_damping[:], model.dof_frictionloss[:] = TRUTH[:3]
-    data, bias, substeps = mujoco.MjData(model), TRUTH[3], round(PERIOD / step)
-    mujoco.mj_setConst(model, data)
+    data, bias, substeps = mujoco.MjData(model := fixed(leg, step).compile()), TRUTH[3], round(PERIOD / step)
     commands, measured, past = np.zeros((len(targets), 5, 3)), [], np.zeros(3)
     commands[:, 1], commands[:, 3], commands[:, 4] = targets, 20.0, 0.5
     whole, share = divmod(TRUTH[4, 0] / step + half + 1e-9, 1.0)
@@ -84,14 +91,14 @@ def noisy(recording, seed=0):
 
 
 def write_log(file, recording, task, modes=None, times=None):
-    """Write a log as deploy.py does."""
+    """Write a log as deploy.py does; the quaternion may be one for each tick."""
     policy = SimpleNamespace(description={"network": {"sha256": "chirp"}, "task": task})
     about = {"policy": policy, "joints": SimpleNamespace(names=recording.joint_order), "period": PERIOD}
     controller = SimpleNamespace(**about, reason="", velocity_command=np.zeros(3), policy_step=None)
     log, nothing = Log(file, controller), np.zeros(len(recording.joint_order))
+    quaternions = np.broadcast_to(recording.quaternion, (len(recording.commands), 4))
     for tick, (command, (pos, vel)) in enumerate(zip(recording.commands, recording.measured, strict=True)):
         controller.sent, controller.mode = MotorCommand(*command), modes[tick] if modes else Mode.POLICY
-        quaternion = np.reshape(recording.quaternion, (-1, 4))[tick % (recording.quaternion.size // 4)]
-        state = RobotState(tick, quaternion, np.zeros(3), pos, vel, nothing, nothing, nothing)
+        state = RobotState(tick, quaternions[tick], np.zeros(3), pos, vel, nothing, nothing, nothing)
         log.add(times[tick] if modes else PERIOD * tick, False, Received(None if np.isnan(pos).any() else state))
     log.close()

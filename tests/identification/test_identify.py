@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from conftest import POSE, TILT, TRUTH, noisy, record, sweep, write_log
+from conftest import NUMBERS, POSE, TILT, TRUTH, noisy, record, sweep, write_log
 from support.scripts import run_here
 from support.settings import error_of
 
@@ -16,8 +16,6 @@ from legged_torque.identification.recording import Recording
 from legged_torque.identification.worlds import FIELDS, HangingRobots
 from legged_torque.runtime.sim_robot import SimRobot
 from legged_torque.utils.options import Options
-
-NUMBERS = np.append(TRUTH[:4].ravel(), TRUTH[4, 0])
 
 
 def test_the_trunk_is_fixed(leg):
