@@ -16,6 +16,7 @@ setup(
     package_dir=BESIDE,
     package_data={
         "legged_torque.deploy": ["policy.schema.json"],
+        "legged_torque.importer": ["scene.xml"],
         "legged_torque.utils": ["successors.yaml"],
         "legged_torque.viewer": ["page.js"],
         "legged_torque.resources": ["robots/**"],

@@ -4,11 +4,13 @@ Examples:
     python scripts/deploy.py exported --interface sim                # a simulated robot in this process
     python scripts/deploy.py exported --interface lo --domain 1      # sim_robot.py in another terminal
     python scripts/deploy.py exported --interface eth0               # a Unitree Go2; never tried on hardware
+    python scripts/deploy.py exported --interface sdk --gamepad      # an A1 or Go1; never tried on hardware
 
 Keys: s stand up, p policy, d or space damping, x no torque, arrows, comma and period the command, 0 stand still, q end.
 """
 
 import argparse
+import contextlib
 import sys
 import time
 from pathlib import Path
@@ -20,16 +22,16 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, Positive, Rate
 
-LINE_EVERY = 1.0  # seconds between two lines of the state
 ROBOT = "go2"  # at the other end of a network interface
-POLL = 0.05  # seconds between two looks at the keys
+POLL = 0.01  # seconds between two looks at keys and other devices
 
 
 def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
     parser = cli.Parser(__doc__)
     parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
-    hint = "network interface of a Unitree Go2, lo for sim_robot.py, or sim for a simulated robot in this process"
+    hint = "network interface of a Unitree Go2, lo for sim_robot.py, sim for a simulated robot in this process, "
+    hint += "or sdk for an A1 or Go1 through unitree_legged_sdk"
     parser.add_argument("--interface", required=True, help=hint)
     parser.add_argument("--domain", type=int, default=0, help="of DDS; Unitree's robots: 0; default: %(default)s")
     parser.add_argument("--rate", type=float, default=500.0, help="commands per second; default: %(default)s")
@@ -41,6 +43,12 @@ def parse_args() -> argparse.Namespace:
         default=[0.0, 0.0, 0.0],
         help="first command: forwards, to the left [m/s], yaw rate [rad/s]; default: stand still",
     )
+    hint = "obey JSON datagrams on a port of this machine, or of one of its addresses; docs/howto/run_on_robot.md"
+    parser.add_argument("--udp", metavar="[ADDRESS:]PORT", help=hint)
+    hint = "obey a gamepad; default: %(const)s"
+    parser.add_argument("--gamepad", nargs="?", const="/dev/input/js0", metavar="DEVICE", help=hint)
+    hint = "with --interface sdk: limit of the SDK's PowerProtect, 1 to 10 for 10 to 100%%; default: 1"
+    parser.add_argument("--power", type=int, help=hint)
     parser.add_argument("--seconds", type=float, help="end after this time; default: when asked to")
     parser.add_argument("--walk", action="store_true", help="stand up and walk without being asked; simulation only")
     hint = "in place of the policy, move all joints of a robot that hangs in the air, for identify.py; default: 40 s"
@@ -49,6 +57,9 @@ def parse_args() -> argparse.Namespace:
     args = parser.parse_args()
     cli.check_args(args, chirp=Annotated[float, Limits(10, 120)])
     cli.check_args(args, rate=Rate, seconds=Positive, command=list[float], domain=Annotated[int, Limits(0, 232)])
+    cli.check_args(args, power=Annotated[int, Limits(1, 10)])
+    if args.power and args.interface != "sdk":
+        raise UserError("--power is for --interface sdk: it limits unitree_legged_sdk's motors")
     if args.walk and args.interface not in ("sim", "lo"):
         raise UserError("--walk is for simulated robots (--interface sim or lo): a real one waits for its operator")
     return args
@@ -61,42 +72,51 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.runtime.controller import Controller
         from legged_torque.runtime.loop import RealTimeLoop
-        from legged_torque.runtime.operator import Operator
         from legged_torque.runtime.session import Session
+        from legged_torque.runtime.view import View
     policy = chirp(args, Policy(args.policy)) if args.chirp else Policy(args.policy)
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
-    session = Session(controller, transport, new_log(args.log, controller) if args.log else None)
-    operator = Operator(controller, walks=args.walk)
-    operator.command(args.command)
-    end = time.monotonic() + (args.seconds or float("inf"))
+    operators = operators_of(args, controller)
+    log = None
+    if args.log:
+        from legged_torque.runtime.log import Log
+
+        log = Log(args.log, controller)
+    session = Session(controller, transport, log)
+    loop = RealTimeLoop(args.rate, session.tick)
+    chirps = [policy] if args.chirp else []
+    view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
     try:
-        with StopRequest(lambda text: None) as stop, RealTimeLoop(args.rate, session.tick) as loop, operator:
-            next_line = time.monotonic()
-            while not stop.requested and not operator.has_ended and time.monotonic() < end and loop.error is None:
-                if args.chirp and policy.has_ended:
+        with StopRequest(lambda text: None) as stop, loop, contextlib.ExitStack() as devices:
+            for device in (view.live, *operators):
+                devices.enter_context(device)
+            while not stop.requested and time.monotonic() < end and loop.error is None:
+                for operator in operators:
+                    operator.look()
+                if any(each.has_ended for each in (*operators, *chirps)):
                     break
-                operator.look()
-                if session.log:
-                    session.log.write()
-                if time.monotonic() >= next_line:
-                    next_line += LINE_EVERY
-                    print(session.line(loop), flush=True)
+                if log:
+                    log.write()
+                view.show()
                 time.sleep(POLL)
-    finally:  # also where a line cannot be printed
+    finally:  # also where nothing can be printed
         session.close()
-    print("\n".join([session.line(loop), *(f"stopped: {reason}" for reason in session.stops)]))
+    print("\n".join([view.line(), *(f"stopped: {reason}" for reason in session.stops)]))
     if loop.error is not None:
         raise loop.error
     if session.stops:
         sys.exit(1)
 
 
-def new_log(file: Path, controller: Any) -> Any:
-    """Return the log of a controller."""
-    from legged_torque.runtime.log import Log
+def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:
+    """Return all that the robot obeys, and give it its first command."""
+    from legged_torque.runtime.operator import Datagrams, Gamepad, Keyboard, Unattended
 
-    return Log(file, controller)
+    operators: list[Any] = [Keyboard(controller), *([Unattended(controller)] if args.walk else [])]
+    operators[0].begin_with(args.command)
+    devices = [(Datagrams, args.udp), (Gamepad, args.gamepad)]
+    return operators + [kind(controller, address) for kind, address in devices if address]
 
 
 def chirp(args: argparse.Namespace, policy: Any) -> Any:
@@ -116,11 +136,16 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
 
         xml = resource_path(policy.description["robot"]["file"])
         return InProcess(SimRobot(xml, policy.joint_order, args.rate, hangs=bool(args.chirp)))
+    trained = policy.description["robot"]["name"]
+    if args.interface == "sdk":
+        from legged_torque.runtime.legged_sdk import LeggedSdkRobot
+
+        return LeggedSdkRobot(trained, args.power or 1)
     from legged_torque.runtime.dds import Go2Robot
 
-    if (trained := policy.description["robot"]["name"]) != ROBOT:
+    if trained != ROBOT:
         raise UserError(
-            f"the policy is of the robot '{trained}'; over a network there are only transports to '{ROBOT}'"
+            f"the policy is of the robot '{trained}'; DDS leads to a '{ROBOT}', --interface sdk to A1 and Go1"
         )
     return Go2Robot(args.interface, args.domain)
 

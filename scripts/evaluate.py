@@ -22,13 +22,12 @@ from legged_torque.experiments.matrix import GROUNDS
 from legged_torque.utils import cli
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import path_inside, portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
-from legged_torque.utils.words import counted
 
 if TYPE_CHECKING:
     from rsl_rl.runners import OnPolicyRunner

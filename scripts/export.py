@@ -3,6 +3,7 @@
 Examples:
     python scripts/export.py                                   # the last run's last checkpoint
     python scripts/export.py --load_run=RUN --checkpoint=500 --out=exported
+    python scripts/export.py --task=go2_position --format=deploy_yaml    # Unitree's params/deploy.yaml as well
 """
 
 import shlex
@@ -18,6 +19,8 @@ def main() -> None:
     """Load a checkpoint and write policy.onnx, policy.pt and policy.yaml; print what the latter does not describe."""
     parser = cli.Parser(__doc__)
     cli.add_options(parser, "task", "device", "set", "task_file", *cli.RUNS)
+    hint = "also write what Unitree's C++ (deploy_yaml) or NVIDIA's package leapp reads"
+    parser.add_argument("--format", choices=("deploy_yaml", "leapp"), help=hint)
     parser.add_argument("--out", type=Path, help="folder to write; default: exported_<checkpoint> in the run's folder")
     args = parser.parse_args()
     if args.out:
@@ -27,14 +30,15 @@ def main() -> None:
         run = task_registry.load_run(options)
         from legged_torque.deploy.export import export_policy, nominal_cfg
         from legged_torque.deploy.policy import Policy
+        from legged_torque.runtime.formats import WRITERS
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
     out = args.out or path_inside(run.folder, f"exported_{iterations}")
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
-    difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training)
+    difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training, WRITERS.get(args.format))
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
-    print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml")
+    print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml{f', {args.format}' if args.format else ''}")
     print(f"  largest difference to the checkpoint's network: {difference:.2g}")
     supplied = Policy(out).supplied if not unsupported else []
     if supplied:

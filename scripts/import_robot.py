@@ -42,9 +42,8 @@ def main() -> None:
     with cli.slow_imports():
         import mujoco
 
-        from legged_torque.importer.check import check
         from legged_torque.importer.mjcf import mjcf
-        from legged_torque.importer.robot import import_robot
+        from legged_torque.importer.robot import check, import_robot
         from legged_torque.importer.settings import settings
         from legged_torque.sim.fused.tree import read_tree
     robot = import_robot(args.file, args.name, args.torque_limit)

@@ -14,9 +14,8 @@ from packaging.requirements import Requirement
 import legged_torque
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
-from legged_torque.utils.errors import collect_errors
+from legged_torque.utils.errors import collect_errors, counted
 from legged_torque.utils.runs import package_versions
-from legged_torque.utils.words import counted
 
 PURPOSES = {
     "video": "videos of play.py and sim2sim.py",

@@ -11,6 +11,7 @@ Examples:
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import functools
 import shlex
 import sys
@@ -26,7 +27,7 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
-from legged_torque.utils.options import DEFAULT_TASK, Options
+from legged_torque.utils.options import DEFAULT_TASK
 from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
 
 if TYPE_CHECKING:
@@ -50,8 +51,6 @@ def main() -> None:
     if args.agent != "policy":
         options.task = options.task or DEFAULT_TASK
     with cli.slow_imports():
-        import rsl_rl.runners  # noqa: F401  # before MuJoCo: Triton's LLVM cannot be loaded after that of Mesa's renderer
-
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(options.task, options)
     env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands
@@ -151,10 +150,8 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
-    options = Options("", args.device, num_envs=1, load_run=args.compare, log_root=args.log_root)
-    options.perturbation, options.ranges, options.set = args.perturbation, args.ranges, args.set
-    options.motors = args.motors
-    options.policy_hz, options.physics_hz = args.policy_hz, args.physics_hz
+    options = dataclasses.replace(cli.options_of(args), task="", num_envs=1, load_run=args.compare)
+    options.checkpoint = options.experiment_name = None
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from legged_torque.paper.report import check_extra
 from legged_torque.utils import cli
+from legged_torque.utils.errors import counted
 from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import NotNegative
-from legged_torque.utils.words import counted
 
 
 def main() -> None:

@@ -17,12 +17,11 @@ from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import LeggedRobotCfg, task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
-from legged_torque.utils.errors import UserError, printable
+from legged_torque.utils.errors import UserError, counted, printable
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
 from legged_torque.utils.options import choose_motors
 from legged_torque.utils.task_registry import LOGS
-from legged_torque.utils.words import counted
 
 
 def parse_args() -> argparse.Namespace:

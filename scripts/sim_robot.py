@@ -7,10 +7,12 @@ Examples:
 """
 
 import argparse
+import contextlib
 import dataclasses
 import math
 import time
-from typing import Annotated
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
@@ -22,6 +24,7 @@ from legged_torque.utils.options import choose_motors
 RATE = 500.0  # messages per second, as a Go2
 TASKS = {"go2": "go2_position"}  # whose settings have the robot's file and motors
 LINE_EVERY = 1.0  # seconds between two lines of the state
+FRAME = 1 / 60  # seconds between two drawings
 
 
 def parse_args() -> argparse.Namespace:
@@ -36,6 +39,7 @@ def parse_args() -> argparse.Namespace:
     hint = "lost, damaged (shares of messages), delay [s], silent=1; dead, hot or error=JOINT; may be repeated"
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
     parser.add_argument("--fault_at", type=float, default=0.0, help="second at which faults begin; default: at once")
+    parser.add_argument("--viewer", action="store_true", help="show it in MuJoCo's window, where the mouse pushes it")
     args = parser.parse_args()
     limits = {"domain": Annotated[int, Limits(0, 232)], "latency": Annotated[float, Limits(0, 1000)]}
     cli.check_args(args, seconds=Positive, fault_at=NotNegative, **limits)
@@ -51,6 +55,9 @@ def main() -> None:
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.sim_robot import Faults, SimRobot
         from legged_torque.runtime.unitree_go2 import encode_state
+        from legged_torque.viewer.native import check_display
+    if args.viewer:
+        check_display("sim_robot.py without --viewer")
     cfg, _ = task_registry.get_cfgs(TASKS[args.robot])
     choose_motors(cfg, args.motors)
     side = Go2Side(args.interface, args.domain)
@@ -69,19 +76,42 @@ def main() -> None:
             message.crc ^= is_damaged
             side.publish(message)
 
-    end = start + (args.seconds or math.inf)
-    with StopRequest(lambda text: None) as stop, RealTimeLoop(RATE, tick) as loop:
-        while not stop.requested and time.monotonic() < end and loop.error is None:
-            time.sleep(LINE_EVERY)
-            what = "damping" if robot.is_damping else "driven"
-            place = " ".join(f"{part:+.2f}" for part in robot.data.qpos[:3])
-            print(
-                f"{what}; place {place}; watchdog {robot.watchdog_ticks}; beyond limits {robot.excess:.3g} N m",
-                flush=True,
-            )
+    end, next_line = start + (args.seconds or math.inf), start
+    show = window(robot) if args.viewer else contextlib.nullcontext(lambda: True)
+    with StopRequest(lambda text: None) as stop, RealTimeLoop(RATE, tick) as loop, show as draw:
+        while not stop.requested and time.monotonic() < end and loop.error is None and draw():
+            if time.monotonic() >= next_line:
+                next_line += LINE_EVERY
+                mode = side.sport_mode.name
+                what = f"sport mode {mode}" if mode else "damping" if robot.is_damping else "driven"
+                place = " ".join(f"{part:+.2f}" for part in robot.data.qpos[:3])
+                numbers = f"watchdog {robot.watchdog_ticks}; beyond limits {robot.excess:.3g} N m"
+                print(f"{what}; place {place}; {numbers}", flush=True)
+            time.sleep(FRAME)
     side.close()
     if loop.error is not None:
         raise loop.error
+
+
+@contextlib.contextmanager
+def window(robot: Any) -> Iterator[Callable[[], bool]]:
+    """Open a window, and give a function that shows the robot and returns whether the window is still open.
+
+    It shows a copy of the state, so that the robot does not wait; forces of the mouse act on the robot.
+    """
+    import mujoco.viewer  # needs a screen
+
+    shown = mujoco.MjData(robot.model)
+    with mujoco.viewer.launch_passive(robot.model, shown, show_left_ui=False, show_right_ui=False) as handle:
+
+        def draw() -> bool:
+            shown.qpos[:] = robot.data.qpos
+            mujoco.mj_forward(robot.model, shown)
+            handle.sync()
+            robot.data.xfrc_applied[:] = shown.xfrc_applied
+            return handle.is_running()
+
+        yield draw
 
 
 def with_faults(faults: object, words: list[str], joints: list[str]) -> object:

@@ -26,12 +26,11 @@ from legged_torque.envs.tasks import list_tasks
 from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
-from legged_torque.utils.errors import TrainingError, UserError
+from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint_of, load_config, new_run_dir, package_versions
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
-from legged_torque.utils.words import counted
 from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:

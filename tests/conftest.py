@@ -8,6 +8,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # of scripts as well: a training in one pro
 
 import pytest
 import torch
+import yaml
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # before anything imports triton: kernels of the update run on the CPU
@@ -49,3 +50,27 @@ def make_task():
         return task_registry.make_env(name, Options(device="cpu"), env_cfg)[0]
 
     return make
+
+
+@pytest.fixture(scope="session")
+def exported(make_task, tmp_path_factory):
+    """Folder of an export of ``a1_torque_multihead``."""
+    from support.exports import export_random
+
+    folder = tmp_path_factory.mktemp("export") / "out"
+    export_random(make_task, "a1_torque_multihead", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def description(exported):
+    """The contents of its ``policy.yaml``."""
+    return yaml.safe_load((exported / "policy.yaml").read_text())
+
+
+@pytest.fixture(scope="session")
+def policy(exported):
+    """The policy; tests reset it before they use it."""
+    from legged_torque.deploy.policy import Policy
+
+    return Policy(exported)

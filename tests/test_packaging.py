@@ -46,10 +46,7 @@ for script, *sys.argv[1:] in json.loads(sys.argv[1]):
 
 
 def run(installed, folder, *commands):
-    """Run installed scripts in a folder, one after the other in a process: names and words of each; return the output.
-
-    They must end well.
-    """
+    """Run installed scripts in a folder, one after the other in a process, which must end well; return the output."""
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}
     environment |= {"PYTHONPATH": str(installed), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-c", RUN, json.dumps(commands)]

@@ -39,8 +39,8 @@ from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.robots import a1, anymal_c, g1, go1, go2
 from legged_torque.motors import model_config
 from legged_torque.sim.engine import Engine
+from legged_torque.utils.config import successors
 from legged_torque.utils.limits import describe, types_of
-from legged_torque.utils.successors import successors
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]

@@ -1,5 +1,6 @@
-"""Reading, checking and writing ``policy.yaml``, the description of how to run a policy on a robot."""
+"""Reading, checking and writing ``policy.yaml``, the description of how to run a policy; its network holds it, too."""
 
+import hashlib
 import importlib.util
 import json
 import math
@@ -22,13 +23,17 @@ SCHEMA: dict[str, Any] = json.loads(Path(__file__).with_name("policy.schema.json
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """Read and check the description of a policy; return it and the file of the network.
 
-    ``path`` is ``policy.yaml``, a network in its folder, or that folder. A UserError names what is missing or wrong.
+    ``path`` is ``policy.yaml``, a network in its folder, or that folder; a network alone describes itself. A UserError
+    names what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
         raise UserError(f"there is no file or folder '{path}'")
     folder, is_network = path if path.is_dir() else path.parent, path.suffix == ".onnx"
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
+    network = path if is_network else folder / NETWORK_FILE
+    if network.is_file() and not file.exists():
+        return _described_by(network), network
     try:
         text = file.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -57,9 +62,41 @@ def to_yaml(description: dict[str, Any]) -> str:
     return "\n".join(parts)
 
 
-def interface(description: dict[str, Any]) -> dict[str, str]:
-    """Return the meaning of a network's inputs and outputs as strings by key, which are stored in the network."""
-    return {key: json.dumps(description[key]) for key in ("joint_order", "nominal_pose", "observations", "actions")}
+def metadata(description: dict[str, Any]) -> dict[str, str]:
+    """Return what a network holds of its description: all but its own checksum, as JSON by section."""
+    network = {key: value for key, value in description["network"].items() if key != "sha256"}
+    return {key: json.dumps(value) for key, value in {**description, "network": network}.items()}
+
+
+def from_metadata(stored: dict[str, str], where: str) -> dict[str, Any]:
+    """Return the sections of a description in a network's metadata, unchecked; ``where`` they are is for errors."""
+    return {key: parse_yaml(text, f"{key} in {where}") for key, text in stored.items() if key in SCHEMA["properties"]}
+
+
+def open_network(file: Path) -> tuple[Any, str]:
+    """Return an onnxruntime session of a file, on one thread, and its checksum; a UserError if it is no network."""
+    require("onnxruntime")
+    import onnxruntime
+
+    content, options = file.read_bytes(), onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime has an exception class per kind of damage
+        raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
+    return session, hashlib.sha256(content).hexdigest()
+
+
+def _described_by(file: Path) -> dict[str, Any]:
+    """Return the checked description that a network holds; a UserError if it holds none."""
+    session, checksum = open_network(file)
+    description = from_metadata(session.get_modelmeta().custom_metadata_map, f"'{file}'")
+    if not isinstance(description.get("network"), dict):  # as in those that are not of export.py, or of an older one
+        raise UserError(f"there is no {DESCRIPTION_FILE} in '{file.parent}', and '{file}' does not describe itself")
+    description["network"]["sha256"] = checksum
+    check(description, f"'{file}'")
+    return description
 
 
 def columns(observations: dict[str, Any]) -> list[str]:
@@ -71,10 +108,7 @@ def columns(observations: dict[str, Any]) -> list[str]:
 
 
 def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
-    """Check structure and values; a UserError names the first wrong entry, and ``where`` it is.
-
-    Entries of which the network has a copy, see :func:`interface`, are compared with it when it is loaded.
-    """
+    """Check structure and values; a UserError names the first wrong entry, and ``where`` it is."""
     _check_schema(description, where)
     joints = description["joint_order"]
     keys = ("nominal_pose", "torque_limits", "joints", "copper_loss")
@@ -114,9 +148,9 @@ def _check_schema(description: Any, where: str) -> None:
         raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
 
 
-def require(*packages: str) -> None:
+def require(*packages: str, extra: str = "export") -> None:
     """Raise a UserError that names the extra if a package is not installed."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            extra = "pip install 'legged_torque[export]'"
-            raise UserError(f"{package} is not installed; exported policies need the extra: {extra}")
+            line = f"pip install 'legged_torque[{extra}]'"
+            raise UserError(f"{package} is not installed; exported policies need the extra: {line}")

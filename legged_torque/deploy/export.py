@@ -5,7 +5,7 @@ import hashlib
 import os
 import tempfile
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from legged_torque.deploy.description import (
     NETWORK_FILE,
     check,
     columns,
-    interface,
+    metadata,
     require,
     to_yaml,
 )
@@ -69,7 +69,12 @@ def nominal_cfg(cfg: Any) -> Any:
 
 
 def export_policy(
-    task: LeggedRobot, model: MLPModel, folder: Path, name: str, training: dict[str, Any]
+    task: LeggedRobot,
+    model: MLPModel,
+    folder: Path,
+    name: str,
+    training: dict[str, Any],
+    add: Callable[[Path, torch.nn.Module], None] | None = None,
 ) -> tuple[float, list[str]]:
     """Write a policy with everything that is needed to run it, and check the files.
 
@@ -83,6 +88,7 @@ def export_policy(
         folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
         name: Name of the task.
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
+        add: Adds files of another format to an export, for its folder and network.
 
     Returns:
         Largest difference between the exported networks and the model, and what is unsupported.
@@ -99,12 +105,14 @@ def export_policy(
     with write_errors(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
         part = Path(temporary)
         difference = write_networks(model, part, description)
-        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
         description["unsupported"] = unknown_parts(task, description) or differences(task, model, Policy(part))
-        (part / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
-        folder.mkdir(exist_ok=True)
-        for file in (NETWORK_FILE, TORCHSCRIPT_FILE, DESCRIPTION_FILE):
-            os.replace(part / file, folder / file)
+        write_description(part, description)
+        if add:
+            add(part, model.as_onnx(verbose=False).cpu().eval())
+        for file in sorted(part.rglob("*.*"), key=lambda file: file.name == DESCRIPTION_FILE):
+            target = folder / file.relative_to(part)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(file, target)
     return difference, description["unsupported"]
 
 
@@ -141,15 +149,24 @@ def export_note(task: LeggedRobot, model: MLPModel) -> str:
     return f"exports of this policy will not be complete: {'; '.join(problems)}" if problems else ""
 
 
-def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -> float:
-    """Write the mean policy as ONNX and TorchScript, normalization of observations included.
-
-    The ONNX network stores its :func:`~legged_torque.deploy.description.interface`; its checksum is added to the
-    ``description``, which is checked. Returns the largest difference of both networks from the model on random
-    observations; if it is too large, a UserError is raised.
-    """
+def write_description(folder: Path, description: dict[str, Any]) -> None:
+    """Store a description in its network, add that file's checksum, check it, and write it as ``policy.yaml``."""
     import onnx
 
+    network = onnx.load(folder / NETWORK_FILE)
+    onnx.helper.set_model_props(network, metadata(description))
+    onnx.save(network, folder / NETWORK_FILE)
+    description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+    check(description)
+    (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
+
+
+def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -> float:
+    """Write the mean policy as ONNX and TorchScript, normalization of observations included, with its ``description``.
+
+    Returns the largest difference of both networks from the model on random observations; if it is too large, a
+    UserError is raised.
+    """
     network, memory = model.as_onnx(verbose=False).cpu().eval(), description["network"].get("memory", [])
     inputs, outputs = (["obs"] + [each["input"] for each in memory], ["actions"] + [each["output"] for each in memory])
     kept = [torch.zeros(each["layers"], 2, each["size"]) for each in memory]
@@ -169,13 +186,9 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
             opset_version=17,
             dynamo=False,
         )
-        exported = onnx.load(folder / NETWORK_FILE)
-        onnx.helper.set_model_props(exported, interface(description))
-        onnx.save(exported, folder / NETWORK_FILE)
         scripted = torch.jit.script(model.as_jit().cpu().eval())
         (folder / TORCHSCRIPT_FILE).write_bytes(scripted.save_to_buffer())
-    description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
-    check(description)
+    write_description(folder, description)
     obs = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
     steps = obs.split(1 if memory else NUM_SAMPLES)
     original, loaded = model.as_jit().cpu().eval(), torch.jit.load(str(folder / TORCHSCRIPT_FILE))

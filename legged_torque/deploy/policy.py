@@ -1,6 +1,5 @@
 """An exported policy in numpy: observations, actions and torques of one robot, without torch or a simulator."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,10 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.deploy.description import interface, read, require
+from legged_torque.deploy.description import SCHEMA, from_metadata, metadata, open_network, read
 from legged_torque.motors.twin import without_function
+from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
+
+IN_OLD_NETWORKS = ("joint_order", "nominal_pose", "observations", "actions")
+"""Sections that networks hold which were exported before all sections were stored."""
 
 
 @dataclass
@@ -149,6 +152,21 @@ class Policy:
             total += np.float32(term["mixing_weight"]) * torques
         return total
 
+    def drive_targets(self, actions: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return tau, q, kp and kd of drives that make tau + kp (q - position) - kd velocity. Shapes: (joints,).
+
+        That is :meth:`wanted_torques` of actions, for the terms position_residual and torque.
+        """
+        q = self.nominal_pose.astype(float)
+        tau, kp, kd = np.zeros((3, len(q)))
+        for term, values in zip(self._action_terms, actions.reshape(-1, len(q)), strict=True):
+            if term["name"] == "torque":
+                tau = term["mixing_weight"] * term["scale"] * values.astype(float)
+            else:
+                q = self.nominal_pose + term["scale"] * values.astype(float)
+                kp, kd = (term["mixing_weight"] * gain for gain in (self.stiffness, self.damping))
+        return tau, q, kp, kd
+
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
         """Return x and y of the points of the height scan in the world, in which the trunk has a pose [m].
 
@@ -233,34 +251,22 @@ def run_network(session: Any, obs: np.ndarray, memory: dict[str, np.ndarray]) ->
     return actions
 
 
-def _sizes(memory: dict[str, Any]) -> list[int]:
-    """Return layers and size of what a network remembers."""
-    return [memory["layers"], memory["size"]]
-
-
 def load_network(file: Path, description: dict[str, Any]) -> Any:
-    """Return an onnxruntime session on one thread; a UserError if the file is not the network of a description."""
-    require("onnxruntime")
-    import onnxruntime
-
-    content, network = file.read_bytes(), description["network"]
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    try:
-        session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime has an exception class per kind of damage
-        raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
-    nodes, memory = (*session.get_inputs(), *session.get_outputs()), network.get("memory", [])
+    """Return the network's session; a UserError that names what differs if it is not the network of a description."""
+    (session, checksum), network = open_network(file), description["network"]
+    nodes = (*session.get_inputs(), *session.get_outputs())
+    memory = [(each["input"], each["output"], [each["layers"], each["size"]]) for each in network.get("memory", [])]
     ends = [(node.name, [size for size in node.shape if isinstance(size, int)]) for node in nodes]  # but for the robots
-    expected = [("obs", [network["num_observations"]]), *((each["input"], _sizes(each)) for each in memory)]
-    expected += [("actions", [network["num_actions"]]), *((each["output"], _sizes(each)) for each in memory)]
+    expected = [("obs", [network["num_observations"]]), *((name, size) for name, _, size in memory)]
+    expected += [("actions", [network["num_actions"]]), *((name, size) for _, name, size in memory)]
     if ends != expected:
         raise UserError(f"'{file}' has the input and output {ends}, not {expected}")
-    if hashlib.sha256(content).hexdigest() != network["sha256"]:
+    if checksum != network["sha256"]:
         raise UserError(f"'{file}' is not the network that was exported with its policy.yaml (sha256 differs)")
-    stored = session.get_modelmeta().custom_metadata_map
-    for key, meaning in interface(description).items():
-        if stored.get(key) != meaning:
-            raise UserError(f"'{file}' was exported with other {key} than those of its policy.yaml, which was changed")
+    stored, described = session.get_modelmeta().custom_metadata_map, metadata(description)
+    sections = SCHEMA["properties"] if "format_version" in stored else IN_OLD_NETWORKS
+    if any(stored.get(section) != described.get(section) for section in sections):
+        held, ours = (flat(from_metadata(each, f"'{file}'")) for each in (stored, described))
+        wrong = [name for name in ours | held if ours.get(name) != held.get(name) and name.split(".")[0] in sections]
+        refuse(wrong[:1], f"'{file}' was exported with another policy.yaml, which was changed in")
     return session

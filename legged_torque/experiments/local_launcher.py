@@ -10,9 +10,9 @@ from typing import Annotated, Any, BinaryIO
 
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.distributed import ending_with_parent
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Limits, check_value
-from legged_torque.utils.processes import ending_with_parent
 
 CPU_JOBS, GPU_JOBS, MPS_JOBS = 1, 2, 4
 """Steps at a time on the CPU, a GPU, and a GPU with ``--mps``, by default: more are hardly faster."""

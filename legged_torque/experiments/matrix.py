@@ -6,14 +6,14 @@ import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.errors import UserError, unknown_name
-from legged_torque.utils.limits import Count, check_value
+from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
@@ -31,9 +31,6 @@ EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, by default."""
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
 """Tiles that are crossed after training, and robots on each of them, by default."""
-KEYS = {"tasks": list[str], "environments": dict[str, list[str]], "seeds": list[int], "ranges": str}
-KEYS |= dict.fromkeys(("train", "evaluation", "grounds"), dict[str, object])
-"""Keys of a description, and the types of their values."""
 TYPES = {"num_envs": Count, "num_steps": Count, "kinds": list[str], "levels": list[float]}
 ROUGH_GROUND = "rough ground"
 """Name of the evaluation on :data:`GROUNDS`. Names of environments have no spaces."""
@@ -106,6 +103,10 @@ class Matrix:
         return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in self.train.items()]
 
 
+KEYS = {name: hint for name, hint in types_of(Matrix).items() if name != "task_files"}
+"""Keys of a description, and the types of their values."""
+
+
 @dataclass(frozen=True)
 class CellState:
     """The progress of a cell."""
@@ -170,8 +171,6 @@ def read_plan(file: Path) -> Matrix:
     for key, value in values.items():
         if key not in KEYS:
             raise unknown_name("experiment key", str(key), KEYS)
-        if get_origin(KEYS[key]) is dict and not isinstance(value, dict):
-            raise UserError(f"{key} must hold entries 'name: value', not {value!r}")
         values[key] = check_value(key, value, KEYS[key])
     for section, defaults in {"evaluation": EVALUATION, "grounds": GROUNDS}.items():
         for key, value in values.get(section, {}).items():

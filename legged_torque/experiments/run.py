@@ -8,8 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
-from statistics import fmean
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
@@ -18,12 +17,13 @@ from rich.table import Column
 from legged_torque.experiments.job import LOST, Job, Launcher, try_lock
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix, check_same, is_done
 from legged_torque.experiments.times import describe, read_times
-from legged_torque.utils.display import duration, is_terminal, time_left_text
+from legged_torque.utils.display import duration, is_terminal, times
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held, write_whole
 from legged_torque.utils.interrupt import StopRequest
 
 POLL = 0.2  # seconds between checks of the processes
+SPEED_OVER = 24 * 3600.0  # seconds over which the speed is averaged
 REDRAW_EVERY = 1.0  # seconds between updates of the display
 RETRIES = 1  # of a step that has failed, from its last checkpoint, before its cell is given up
 MAX_LOST = 10  # machines that a step may lose before its cell is given up
@@ -49,11 +49,12 @@ class ExperimentRun:
         cells = matrix.cells(out)
         self._queue = [cell for cell in cells if not is_done(cell)]
         self._num_cells, self._num_done = len(cells), len(cells) - len(self._queue)
+        self._display = bars()
+        self._all = self._display.add_task("", total=self._num_cells, completed=self._num_done, note="")
         self._running: dict[Iterator[Job], Job] = {}  # the steps of each cell in work, and the present one
         self._failures: list[str] = []  # a message per failed cell
         self._reported: set[Cell] = set()  # cells reported to be held by another process
-        self._durations: list[float] = []  # of cells finished here [s]
-        self._start = self._counted = self._shown = time.monotonic()
+        self._counted = self._shown = time.monotonic()
         self._stop = CountedStop()
 
     def run(self) -> int:
@@ -61,7 +62,7 @@ class ExperimentRun:
         print(f"{self._num_done} of {self._num_cells} cells are done in {self._out}", flush=True)
         passed_on = 0
         try:
-            with self._stop, bars() as display:
+            with self._stop, self._display:
                 while self._running or (self._queue and not self._stop.requested):
                     if self._stop.count > passed_on:
                         passed_on = self._stop.count
@@ -71,7 +72,7 @@ class ExperimentRun:
                         if job.process.poll() is not None:
                             self._advance(steps)
                     self._take_cells()
-                    self._show(display)
+                    self._show()
                     time.sleep(POLL)
         finally:
             self._ask_to_stop()  # after an exception too no process is left running
@@ -117,7 +118,7 @@ class ExperimentRun:
 
         A step that fails is tried again, from its last checkpoint, before the cell is given up.
         """
-        start, tries = time.monotonic(), Counter[bool]()
+        tries = Counter[bool]()
         with lock:
             while not is_done(cell):
                 try:
@@ -143,7 +144,6 @@ class ExperimentRun:
                         self._fail(cell, problem, [f"the last lines of {job.log}:", *job.output().splitlines()[-10:]])
                         return
                     self._print(f"{cell.name}: {problem}; it will be tried again | {self._progress()}")
-        self._durations.append(time.monotonic() - start)
 
     def _fail(self, cell: Cell, reason: str, lines: list[str]) -> None:
         """Give up a cell; the reason and further lines are printed at the end."""
@@ -166,31 +166,26 @@ class ExperimentRun:
         if self._running:
             self._print("Stopping: trainings finish their iteration and save; once more to stop at once.")
 
-    def _begun(self) -> float:
-        """Return the part of running cells that is done, in cells; an evaluation takes little."""
-        return sum(job.progress()[1] if job.kind == "training" else 1.0 for job in self._running.values())
-
     def _progress(self) -> str:
-        """Describe the progress of all cells and the time left."""
-        cells = self._num_cells - self._num_done - len(self._failures) - self._begun()
-        left = time_left_text(time_left(self._durations, cells, self._launcher.room()))
-        return f"{self._num_done} of {self._num_cells} cells done, {duration(time.monotonic() - self._start)}, {left}"
+        """Describe the progress of all cells and the time left. An evaluation takes little: its cell counts as done."""
+        begun = sum(job.progress()[1] if job.kind == "training" else 1.0 for job in self._running.values())
+        self._display.update(self._all, completed=self._num_done + len(self._failures) + begun)
+        return f"{self._num_done} of {self._num_cells} cells done, {times(self._display.tasks[0])}"
 
     def _print(self, text: str) -> None:
         """Print a line with the time."""
         print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
-    def _show(self, display: Progress) -> None:
+    def _show(self) -> None:
         """Show a bar for all cells and one for each running step."""
-        now = time.monotonic()
+        now, display = time.monotonic(), self._display
         if display.disable or now - self._shown < REDRAW_EVERY:
             return
         self._shown = now
-        for bar in display.task_ids:
+        for bar in display.task_ids[1:]:
             display.remove_task(bar)
-        done = round(100 * (self._num_done + self._begun()) / self._num_cells)
         text, note = self._progress().split(", ", 1)
-        display.add_task(text, completed=done, note=note)
+        display.update(self._all, description=text, note=note)
         for job in self._running.values():
             doing, share, note = job.progress()
             text = f"{job.cell.name} on {job.process.place or 'no machine yet'}: {doing}"
@@ -202,8 +197,13 @@ def bars() -> Progress:
     """Return a display of bars with notes, which is shown on a terminal only."""
     name = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1))
     columns = (name, BarColumn(20), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    console, is_shown = Console(highlight=False), is_terminal(sys.stdout)
-    return Progress(*columns, console=console, auto_refresh=False, transient=True, expand=True, disable=not is_shown)
+    how: dict[str, Any] = {
+        "auto_refresh": False,
+        "transient": True,
+        "expand": True,
+        "speed_estimate_period": SPEED_OVER,
+    }
+    return Progress(*columns, console=Console(highlight=False), disable=not is_terminal(sys.stdout), **how)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
@@ -214,10 +214,3 @@ def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
         copy, text = out / SETTINGS_FILE, file.read_bytes()
         if not copy.is_file() or copy.read_bytes() != text:
             write_whole(copy, text)
-
-
-def time_left(durations: list[float], cells: float, num_steps: int) -> float | None:
-    """Return the time for the cells that are left [s], from the durations of finished ones [s]; None if unknown."""
-    if cells <= 0:
-        return 0.0
-    return fmean(durations) * max(cells / max(num_steps, 1), min(cells, 1.0)) if durations else None

@@ -1,6 +1,7 @@
 """Writing the MJCF of an imported robot."""
 
 import re
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -9,45 +10,12 @@ from legged_torque.importer.legs import FOOT
 from legged_torque.importer.robot import Robot
 from legged_torque.utils.mjcf import loading
 
-SCENE = """
-<mujoco>
-  <compiler angle="radian"/>
-  <option timestep="0.005" solver="Newton" cone="pyramidal" integrator="implicitfast" impratio="100"/>
-  <visual>
-    <global offwidth="1920" offheight="1080" azimuth="140" elevation="-18"/>
-    <headlight ambient="0.3 0.3 0.3" diffuse="0.3 0.3 0.3" specular="0.1 0.1 0.1"/>
-  </visual>
-  <asset>
-    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.36 0.50 0.68" rgb2="0.92 0.94 0.96" width="512"
-             height="3072"/>
-    <texture name="floor" type="2d" builtin="checker" rgb1="0.52 0.56 0.61" rgb2="0.46 0.50 0.55" mark="edge"
-             markrgb="0.66 0.70 0.74" width="512" height="512"/>
-    <material name="floor" texture="floor" texrepeat="2 2" texuniform="true" specular="0.1"/>
-    <material name="body" rgba="0.60 0.62 0.65 1" specular="0.5"/>
-    <material name="rubber" rgba="0.05 0.05 0.05 1" specular="0.1"/>
-  </asset>
-  <default>
-    <geom group="1" contype="0" conaffinity="1" condim="3" friction="1.0 0.005 0.0001" solref="-1000 -80"
-          material="body"/>
-    <default class="foot">
-      <geom priority="1" material="rubber"/>
-    </default>
-  </default>
-  <worldbody>
-    <geom name="floor" type="plane" size="0 0 0.05" material="floor" contype="1" conaffinity="0"/>
-    <body>
-      <freejoint name="root"/>
-      <light name="sun" mode="trackcom" pos="1 -1 4" dir="-0.25 0.25 -1" cutoff="89" exponent="0"/>
-      <camera name="track" mode="trackcom" xyaxes="0.7071 0.7071 0 -0.2126 0.2126 0.9537" fovy="40"/>
-    </body>
-  </worldbody>
-</mujoco>
-"""
-"""Everything but the robot's own parts. The robot's geoms touch the floor and never each other."""
+SCENE = Path(__file__).with_name("scene.xml")  # everything but the robot's own parts
 COMMENT = """{name}: written by scripts/import_robot.py. Its geoms touch the floor and never each other.
      Source: {file}
      Changes:
 {notes}"""
+DIGITS = 1e-5  # share of the largest moment of inertia by which six digits may break A + B >= C
 DISTANCE, ELEVATION = 2.5, 1.0  # of the camera along x and -y, and over the trunk; in heights of the trunk
 
 
@@ -57,7 +25,7 @@ def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
     Numbers have six digits. A UserError if MuJoCo refuses the text or warns of it.
     """
     model, height = robot.source.model, robot.stance.height
-    spec = mujoco.MjSpec.from_string(SCENE)
+    spec = mujoco.MjSpec.from_file(str(SCENE))
     spec.modelname = robot.name
     spec.stat.center, spec.stat.extent = [0.0, 0.0, round(0.8 * height, 3)], round(2.3 * height, 3)
     trunk = spec.worldbody.first_body()
@@ -83,7 +51,7 @@ def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
         )
     for number, body in bodies.items():
         body.name = model.body(number).name or robot.shapes[number][0].name
-        body.mass, body.inertia = model.body_mass[number], model.body_inertia[number]
+        body.mass, body.inertia = model.body_mass[number], _writable(model.body_inertia[number])
         body.ipos, body.iquat, body.explicitinertial = model.body_ipos[number], model.body_iquat[number], True
         for shape in robot.shapes[number]:
             default = spec.find_default("foot" if shape.name.endswith(FOOT) else "main")
@@ -102,3 +70,10 @@ def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
     text = f"<!-- {re.sub('-(?=-)', '- ', comment)} -->\n{spec.to_xml()}"  # XML forbids two dashes in a comment
     with loading(robot.source.file):
         return text, mujoco.MjModel.from_xml_string(text)
+
+
+def _writable(moments: np.ndarray) -> np.ndarray:
+    """Return moments of inertia of which A + B >= C holds in six digits, the two smaller ones raised if need be."""
+    order, raised = np.argsort(moments), moments.copy()
+    raised[order[:2]] += 0.5 * max(0.0, (2.0 + DIGITS) * moments[order[2]] - moments.sum())
+    return raised

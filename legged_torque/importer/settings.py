@@ -10,6 +10,7 @@ from legged_torque.importer.robot import Robot
 
 WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
 TORQUE_SCALE = 1.1  # torque of an action of 1, as a multiple of the largest that holds the nominal pose; as for the A1
+SCALED_HEIGHT = 0.28  # trunk height for which that holds; larger robots with four legs learn sooner with less [m]
 ACTION_SCALE = (0.25, 0.15)  # without and with two legs, whose gains are higher than the G1's [rad]
 LINE = 90  # most characters of a literal in one line
 
@@ -89,6 +90,7 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
     cls = "".join(part.capitalize() for part in robot.name.split("_"))  # AnymalC for anymal_c
     penalized, two_legs = _penalized(robot), len(robot.legs) == 2
     stance, leverage = robot.stance, robot.source.weight * robot.stance.height
+    relative = 1.0 if two_legs else SCALED_HEIGHT / stance.height
     return TEMPLATE.format(
         title=robot.name,
         file=ascii(robot.source.file.name),
@@ -106,7 +108,7 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
         angles=_literal(dict(zip(robot.joints, (stance.angles.round(3) + 0.0).tolist(), strict=True))),
         stiffness=_table(robot.by_kind(stance.stiffness)),
         damping=_table(robot.by_kind(stance.damping)),
-        torque_scale=float(f"{TORQUE_SCALE * stance.load:.2g}"),
+        torque_scale=float(f"{TORQUE_SCALE * stance.load * relative:.2g}"),
         height=round(stance.height, 3),
         torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
         action_scale=ACTION_SCALE[two_legs],

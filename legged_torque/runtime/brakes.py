@@ -39,12 +39,7 @@ class Joints:
 def fault(state: RobotState, age: float, received: Received, joints: Joints, brakes: Brakes) -> str:
     """Return why a robot must not walk on, in words that name the part; empty if it may.
 
-    Args:
-        state: The newest state.
-        age: Since when it has been known [s].
-        received: What came with the last look, of damaged messages since the last whole one.
-        joints: Limits of the joints.
-        brakes: Limits of all else.
+    The state has been known for ``age`` [s]; of damaged messages, ``received`` has those since the last whole one.
     """
     if age > brakes.max_age:
         return f"no state for {1e3 * age:.0f} ms, at most {1e3 * brakes.max_age:.0f} are allowed"

@@ -2,7 +2,6 @@
 
 import threading
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
@@ -26,9 +25,6 @@ class Controller:
 
     The operator may call :meth:`request` from another thread.
 
-    The drives close the loop of a policy's position targets themselves, with the policy's gains; its torques are sent
-    as feed-forward torques.
-
     Attributes:
         mode: What the robot does.
         reason: Why it was stopped; empty if it was not.
@@ -41,26 +37,21 @@ class Controller:
     """
 
     def __init__(self, policy: Policy, joint_order: list[str], rate: float, brakes: Brakes | None = None) -> None:
-        """Prepare to drive a robot.
+        """Prepare to drive a robot with joints in an order of its own, ``rate`` ticks a second, by default brakes.
 
         A UserError if robot and policy have different joints, or ``rate`` is no multiple of the policy's.
-
-        Args:
-            policy: The policy.
-            joint_order: Names of the robot's joints, in its own order.
-            rate: Ticks per second.
-            brakes: Limits; None takes the defaults.
         """
         self.policy, self.brakes, self.period = policy, brakes or Brakes(), 1.0 / rate
-        self._ticks_per_action = round(rate / policy.description["timing"]["control_frequency"])
-        if abs(rate - self._ticks_per_action * policy.description["timing"]["control_frequency"]) > 1e-6 * rate:
-            of_policy = policy.description["timing"]["control_frequency"]
+        of_policy = policy.description["timing"]["control_frequency"]
+        self._ticks_per_action = round(rate / of_policy)
+        if abs(rate - self._ticks_per_action * of_policy) > 1e-6 * rate:
             raise UserError(f"--rate must be a multiple of the policy's {of_policy:g} Hz, not {rate:g}")
         self._find_joints(joint_order)
         self.mode, self.reason = Mode.DAMPING, ""
         self.state: RobotState | None = None
         self.velocity_command = np.zeros(3)
         self._since, self._state_time, self._now, self._missed, self._damaged = 0.0, -np.inf, 0.0, 0, 0
+        self._problems: list[str] = []  # of the last look
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
         self.sent, self._lock = self._gentle(0.0), threading.Lock()
         self.policy_step: PolicyStep | None = None
@@ -68,20 +59,10 @@ class Controller:
     def _find_joints(self, joint_order: list[str]) -> None:
         """Put the limits of the policy's joints into the robot's order; a UserError if it needs what is not there."""
         policy, joints = self.policy, self.policy.description["joints"]
-        refuse(
-            [
-                str(unknown_name("joint of the policy on the robot", name, joint_order))
-                for name in policy.joint_order
-                if name not in joint_order
-            ]
-        )
-        refuse(
-            [
-                f"the policy does not know the robot's joint '{name}'"
-                for name in joint_order
-                if name not in policy.joint_order
-            ]
-        )
+        missing = [name for name in policy.joint_order if name not in joint_order]
+        refuse([str(unknown_name("joint of the policy on the robot", name, joint_order)) for name in missing])
+        others = [name for name in joint_order if name not in policy.joint_order]
+        refuse([f"the policy does not know the robot's joint '{name}'" for name in others])
         if not all("range" in joints[name] and joints[name]["max_velocity"] > 0.0 for name in joint_order):
             raise UserError("policy.yaml lacks ranges of joints, or speeds (asset.max_dof_vel): export the policy anew")
         self._order = np.array([policy.joint_order.index(name) for name in joint_order])  # of the policy's vectors
@@ -107,7 +88,7 @@ class Controller:
             stands = self.mode == Mode.STAND and self._now - self._since >= self.brakes.stand_up
             if mode == Mode.POLICY and not stands:
                 return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
-            if mode == Mode.STAND and (problem := self._fault(Received())):
+            if mode == Mode.STAND and (problem := self._fault()):
                 return problem
             self._enter(mode)
             self.reason = ""
@@ -130,13 +111,7 @@ class Controller:
     # ---- a tick ------------------------------------------------------------------------------------------------------
 
     def step(self, received: Received, now: float, missed: bool = False) -> MotorCommand:
-        """Return the command of a tick.
-
-        Args:
-            received: What the robot has said since the last tick.
-            now: The time [s].
-            missed: Whether the last deadline was missed.
-        """
+        """Return the command of a tick at a time [s], of what was received since the last, which may be ``missed``."""
         with self._lock:
             self.policy_step = None
             try:
@@ -152,7 +127,8 @@ class Controller:
         if isinstance(received.newest, RobotState):
             self.state, self._state_time, self._damaged = received.newest, now, 0
         self._damaged += received.wrong_crc
-        if problem := self._fault(received):
+        self._problems = received.problems
+        if problem := self._fault():
             self.stop(problem)
         if self.mode in (Mode.STAND, Mode.POLICY) and self.state is not None:
             return self._moving(self.state)
@@ -167,13 +143,13 @@ class Controller:
         before = np.clip(torques_of(self.sent, state), *self.joints.torque_limits)
         return limited(command, state, before, self.brakes.torque_rate * self.period, self.joints)
 
-    def _fault(self, received: Received) -> str:
+    def _fault(self) -> str:
         """Return why the robot must not move."""
         if self.state is None:
             return "the robot has not said anything yet"
         if self._missed > self.brakes.max_missed:
             return f"{self._missed} deadlines were missed in a row"
-        seen = Received(None, self._damaged, problems=received.problems)
+        seen = Received(None, self._damaged, problems=self._problems)
         return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)
 
     def _gentle(self, damping: float) -> MotorCommand:
@@ -194,33 +170,15 @@ class Controller:
         """Return the policy's command; at first it takes over from standing bit by bit."""
         policy, to_policy = self.policy, np.argsort(self._order)
         if self._tick % self._ticks_per_action == 0:
-            seen = State(
-                state.angular_velocity,
-                state.joint_positions[to_policy],
-                state.joint_velocities[to_policy],
-                quaternion=state.quaternion,
-            )
+            joints = state.joint_positions[to_policy], state.joint_velocities[to_policy]
+            seen = State(state.angular_velocity, *joints, quaternion=state.quaternion)
             obs = policy.observation(seen, self.velocity_command)
             self._actions = policy.act(obs)
             self.policy_step = PolicyStep(obs, self._actions, is_first=self._tick == 0)
         self._tick += 1
-        command = drive_command(policy, self._actions)
-        command = MotorCommand(*(part[self._order].astype(float) for part in vars(command).values()))
+        tau, q, kp, kd = (part[self._order] for part in policy.drive_targets(self._actions))
+        command = MotorCommand(tau, q, np.zeros(len(q)), kp, kd)
         share = min(1.0, (self._now - self._since) / self.brakes.ramp)
         standing = self._standing(np.inf)
         parts = zip(vars(standing).values(), vars(command).values(), strict=True)
         return MotorCommand(*((1.0 - share) * old + share * new for old, new in parts))
-
-
-def drive_command(policy: Policy, actions: np.ndarray) -> MotorCommand:
-    """Return what drives do for actions, in the policy's order: the same law as ``Policy.wanted_torques``."""
-    joints = len(policy.joint_order)
-    tau, q, kp, kd = np.zeros(joints), policy.nominal_pose.astype(float), np.zeros(joints), np.zeros(joints)
-    term: dict[str, Any]
-    for term, values in zip(policy.description["actions"]["terms"], actions.reshape(-1, joints), strict=True):
-        scaled, weight = term["scale"] * values.astype(float), term["mixing_weight"]
-        if term["name"] == "torque":
-            tau += weight * scaled
-        else:
-            q, kp, kd = q + scaled, weight * policy.stiffness, weight * policy.damping
-    return MotorCommand(tau, q, np.zeros(joints), kp, kd)

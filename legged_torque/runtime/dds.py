@@ -1,11 +1,12 @@
 """Unitree's low-level topics over DDS: a robot as the program sees it, and a simulated robot's own side."""
 
 import socket
+import time
 from collections.abc import Callable
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
-from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.runtime.interface import JOINT_ORDER, MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError, unknown_name
 
 try:
@@ -18,11 +19,12 @@ try:
     from cyclonedds.topic import Topic
 
     from legged_torque.runtime import unitree_go2
+    from legged_torque.runtime.motion_switcher import SERVICE, Release, Request_, Response_, SportMode
     from legged_torque.runtime.unitree_go2 import LowCmd_, LowState_
 except ImportError as error:
     raise UserError(f"DDS needs the extra: pip install 'legged_torque[robot]' ({error})") from None
 
-TOPICS: dict[type, str] = {LowCmd_: "rt/lowcmd", LowState_: "rt/lowstate"}
+TOPICS: dict[type, str] = {LowCmd_: "rt/lowcmd", LowState_: "rt/lowstate", **SERVICE}
 DEPTH = 32  # messages that wait for the next look; at 500 Hz, 64 ms
 NUMBERS = 2**32  # numbers of messages start anew after these
 READER = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH))
@@ -37,63 +39,52 @@ WRITER = Qos(
 def configuration(interface: str) -> str:
     """Return Cyclone DDS's settings for one network interface; loopback is searched without multicast."""
     network = f"<NetworkInterface name={quoteattr(interface)}"
-    if interface != "lo":
-        return f"<CycloneDDS><Domain><General><Interfaces>{network}/></Interfaces></General></Domain></CycloneDDS>"
-    general = f"<Interfaces>{network} multicast='false'/></Interfaces><AllowMulticast>false</AllowMulticast>"
-    discovery = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
+    general, discovery = f"<Interfaces>{network}/></Interfaces>", ""
+    if interface == "lo":
+        general = f"<Interfaces>{network} multicast='false'/></Interfaces><AllowMulticast>false</AllowMulticast>"
+        discovery = "<ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers>"
     domain = f"<General>{general}</General><Discovery>{discovery}</Discovery>"
     return f"<CycloneDDS><Domain>{domain}</Domain></CycloneDDS>"
 
 
+def _taken(reader: DataReader) -> list[Any]:
+    """Return the newest messages, without those that say that the other side has left."""
+    return [message for message in reader.take(N=DEPTH) if not isinstance(message, InvalidSample)]
+
+
 class _Side:
-    """One of two sides: publishes one topic and reads the other. Nothing here waits.
+    """One of two sides: publishes one topic and reads the other, and has an end of the motion switcher's service.
 
-    The settings of CYCLONEDDS_URI are not read, so that ``interface`` is the one that is used.
-
-    Args:
-        interface: Name of the network interface.
-        domain: Number of the DDS domain; of Unitree's robots 0, of unitree_mujoco 1. One side per process and domain.
-        writes: Type of the messages that this side publishes.
-        reads: Type of the messages of the other side.
-        decode: What returns the contents of a message.
-        number: Name of the field that numbers the messages; 0 in all of them says that they have no numbers.
-        step: By how much the number grows from message to message.
-
-    Raises:
-        UserError: If there is no such interface, or DDS cannot use it or the domain.
+    Nothing here waits. The settings of CYCLONEDDS_URI are not read, so that ``interface`` is the one that is used.
     """
 
-    joint_order = unitree_go2.JOINT_ORDER
+    joint_order = JOINT_ORDER
+    writes: tuple[type, type]  # types of this side's messages and of its end of the service
+    reads: tuple[type, type]  # of the other side
+    decode: Callable[[Any], RobotState | MotorCommand]  # returns the contents of a message
+    number: str  # name of the field that numbers the messages; 0 in all of them says that they have no numbers
+    step: int  # by how much the number grows from message to message
 
-    def __init__(
-        self,
-        interface: str,
-        domain: int,
-        *,
-        writes: type,
-        reads: type,
-        decode: Callable[[Any], RobotState | MotorCommand],
-        number: str,
-        step: int,
-    ) -> None:
-        """Join the domain."""
+    def __init__(self, interface: str, domain: int) -> None:
+        """Join a domain: of Unitree's robots 0, of unitree_mujoco 1. One side per process and domain.
+
+        A UserError if there is no such network interface, or DDS cannot use it or the domain.
+        """
         names = [name for _, name in socket.if_nameindex()]
         if interface not in names:
             raise unknown_name("network interface", interface, names)
         try:
             self._domain = Domain(domain, configuration(interface))
             self._participant = DomainParticipant(domain)
-            self._writer = DataWriter(self._participant, self._topic(writes), WRITER)
-            self._reader = DataReader(self._participant, self._topic(reads), READER)
+            here = self._participant
+            topics = {kind: Topic(here, TOPICS[kind], kind) for kind in (*self.writes, *self.reads)}
+            self._writer, self._service_writer = (DataWriter(here, topics[kind], WRITER) for kind in self.writes)
+            self._reader, self._service_reader = (DataReader(here, topics[kind], READER) for kind in self.reads)
         except DDSException as error:
             rule = "the interface must be up, the domain from 0 to 232, and used once in this process"
             raise UserError(f"no DDS on interface '{interface}' in domain {domain}: {rule} ({error.msg})") from None
-        self._reads, self._decode, self._number, self._step = TOPICS[reads], decode, number, step
         self._senders: list[int] = []  # of messages so far, the last one at the end
         self._newest = 0
-
-    def _topic(self, kind: type) -> Topic:
-        return Topic(self._participant, TOPICS[kind], kind)
 
     def receive(self) -> Received:
         """Return what has come since the last call: at most the newest DEPTH messages, those before are lost.
@@ -101,11 +92,9 @@ class _Side:
         A message that is refused is missing by its number, too. Repeated messages count as late.
         """
         received = Received()
-        for message in self._reader.take(N=DEPTH):
-            if isinstance(message, InvalidSample):
-                continue  # the other side has left
+        for message in _taken(self._reader):
             try:
-                contents = self._decode(message)
+                contents = type(self).decode(message)
             except unitree_go2.CrcError:
                 received.wrong_crc += 1
             except unitree_go2.MessageError as error:
@@ -117,10 +106,10 @@ class _Side:
 
     def _is_newest(self, message: LowCmd_ | LowState_, received: Received) -> bool:
         """Return whether a message is newer than all of its sender before it; counts what is lost and late."""
-        sender, number = message.sample_info.publication_handle, getattr(message, self._number)
+        sender, number = message.sample_info.publication_handle, getattr(message, self.number)
         if sender not in self._senders[-1:]:
             if sender in self._senders:
-                received.problems.append(f"two programs send {self._reads}")
+                received.problems.append(f"two programs send {TOPICS[self.reads[0]]}")
                 self._senders.remove(sender)
             self._senders.append(sender)
             self._newest = 0
@@ -129,58 +118,72 @@ class _Side:
             if not 0 < ahead < NUMBERS // 2:
                 received.late += 1
                 return False
-            received.lost += max(ahead // self._step - 1, 0)
+            received.lost += max(ahead // self.step - 1, 0)
         self._newest = number
         return True
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._reader = self._writer = self._service_reader = self._service_writer = None
+        self._participant = self._domain = None
 
     def publish(self, message: LowCmd_ | LowState_) -> None:
         """Send a message as it is."""
         self._writer.write(message)
 
-    def close(self) -> None:
-        """Leave the domain."""
-        self._reader = self._writer = self._participant = self._domain = None
-
 
 class Go2Robot(_Side):
     """A robot, real or simulated, as the program sees it: a :class:`~legged_torque.runtime.interface.Transport`.
 
-    States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message.
+    States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message. While the robot's sport
+    mode is not released, that is a problem, and no command is sent. A robot that starts anew is asked anew.
     """
+
+    writes, reads = (LowCmd_, Request_), (LowState_, Response_)
+    decode, number, step = staticmethod(unitree_go2.decode_state), "tick", unitree_go2.STATE_PERIOD
 
     def __init__(self, interface: str, domain: int) -> None:
         """Join the robot's domain; arguments and errors are those of the base class."""
-        super().__init__(
-            interface,
-            domain,
-            writes=LowCmd_,
-            reads=LowState_,
-            decode=unitree_go2.decode_state,
-            number="tick",
-            step=unitree_go2.STATE_PERIOD,
-        )
-        self._sent = 0
+        super().__init__(interface, domain)
+        self._sent, self._release = 0, Release(self._service_writer.write, is_optional=interface == "lo")
+
+    def receive(self) -> Received:
+        """Return what has come, and ask for what is missing."""
+        sender, received = self._senders[-1:], super().receive()
+        if self._senders[-1:] != sender:
+            self._release.begin()
+        if self._release.problem:
+            self._release.look(_taken(self._service_reader), time.monotonic())
+        received.problems += filter(None, [self._release.problem])
+        return received
 
     def send(self, command: MotorCommand) -> None:
-        """Tell the drives; raises MessageError if a number is not finite."""
-        self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
-        self.publish(unitree_go2.encode_command(command, self._sent))
+        """Tell the drives, once they are free; raises MessageError if a number is not finite."""
+        if not self._release.problem:
+            self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
+            self.publish(unitree_go2.encode_command(command, self._sent))
 
 
 class Go2Side(_Side):
-    """The side of a simulated robot: reads commands, tells states."""
+    """The side of a simulated robot: tells states, and reads commands once its sport mode has been released."""
+
+    writes, reads = (LowState_, Response_), (LowCmd_, Request_)
+    decode, number, step = staticmethod(unitree_go2.decode_command), "reserve", 1
 
     def __init__(self, interface: str, domain: int) -> None:
         """Join the domain; arguments and errors are those of the base class."""
-        super().__init__(
-            interface,
-            domain,
-            writes=LowState_,
-            reads=LowCmd_,
-            decode=unitree_go2.decode_command,
-            number="reserve",
-            step=1,
-        )
+        super().__init__(interface, domain)
+        self.sport_mode = SportMode()
+
+    def receive(self) -> Received:
+        """Return what has come; a command in the sport mode is a problem, and not obeyed."""
+        received = super().receive()
+        if self.sport_mode.name and received.newest:
+            received.newest = None
+            received.problems.append(f"a command in the sport mode '{self.sport_mode.name}'")
+        for request in _taken(self._service_reader):
+            self._service_writer.write(self.sport_mode.answer(request))
+        return received
 
     def send(self, state: RobotState) -> None:
         """Tell the program; raises MessageError if a number is not finite."""

@@ -5,6 +5,10 @@ from typing import Protocol
 
 import numpy as np
 
+JOINT_ORDER = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
+"""Of Unitree's A1, Go1 and Go2."""
+NO_POSITION, NO_VELOCITY = 2.146e9, 16000.0  # as q and dq of Unitree's drives: nothing is held, nothing damped
+
 
 @dataclass
 class RobotState:

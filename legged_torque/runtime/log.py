@@ -53,12 +53,8 @@ class Log:
         names = orjson.dumps(controller.joints.names).decode()
         about = {"joint_order": names, "sha256": description["network"]["sha256"], "task": description["task"]}
         self._writer.add_metadata(ROBOT, about | {"period": repr(controller.period)})
-        self._channels = {name: self._channel(name) for name in (TICK, POLICY)}
-
-    def _channel(self, name: str) -> int:
-        """Return a new channel of objects."""
-        schema = self._writer.register_schema(name, "jsonschema", b'{"type": "object"}')
-        return self._writer.register_channel(name, "json", schema)
+        schema = self._writer.register_schema("object", "jsonschema", b'{"type": "object"}')
+        self._channels = {name: self._writer.register_channel(name, "json", schema) for name in (TICK, POLICY)}
 
     def add(self, now: float, missed: bool, received: Received) -> None:
         """Keep a tick that has just been made, at a time [s]."""

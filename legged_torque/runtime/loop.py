@@ -45,9 +45,7 @@ class RealTimeLoop:
         gc.disable()
         self._switch = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH)
-        with contextlib.suppress(OSError, AttributeError):  # without permission, or not on Linux
-            for thread in os.listdir("/proc/self/task"):  # those that receive messages as well
-                os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(PRIORITY))
+        _schedule("SCHED_FIFO", PRIORITY)
         self._thread.start()
         return self
 
@@ -56,9 +54,7 @@ class RealTimeLoop:
         self._ended.set()
         self._thread.join()
         sys.setswitchinterval(self._switch)
-        with contextlib.suppress(OSError, AttributeError):
-            for thread in os.listdir("/proc/self/task"):
-                os.sched_setscheduler(int(thread), os.SCHED_OTHER, os.sched_param(0))
+        _schedule("SCHED_OTHER", 0)
         gc.enable()
         gc.unfreeze()
 
@@ -80,3 +76,10 @@ class RealTimeLoop:
                     time.sleep(max(left, 0.0))
         except BaseException as error:
             self.error = error
+
+
+def _schedule(policy: str, priority: int) -> None:
+    """Have Linux schedule all threads so, those that receive messages as well, if it is permitted."""
+    with contextlib.suppress(OSError, AttributeError):
+        for thread in os.listdir("/proc/self/task"):
+            os.sched_setscheduler(int(thread), getattr(os, policy), os.sched_param(priority))

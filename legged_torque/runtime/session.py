@@ -1,15 +1,11 @@
-"""A policy on a robot: control loop, counts, and a line for the operator."""
+"""A policy on a robot: what the control loop does, and counts."""
 
 import time
 from collections import Counter
 from typing import Any
 
-import numpy as np
-
-from legged_torque.runtime.brakes import torques_of
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.interface import Transport
-from legged_torque.runtime.loop import RealTimeLoop
 
 FAREWELL = 0.1  # seconds in which damping is sent at the end
 
@@ -31,7 +27,7 @@ class Session:
         self.stops: list[str] = []
 
     def tick(self, now: float, missed: bool) -> None:
-        """Listen, decide, and tell the drives; see :class:`RealTimeLoop`."""
+        """Listen, decide, and tell the drives; see :class:`~legged_torque.runtime.loop.RealTimeLoop`."""
         received = self._transport.receive()
         new = {"messages": int(received.newest is not None), "damaged": received.wrong_crc}
         self.counts.update(new | {"lost": received.lost, "late": received.late, "missed deadlines": int(missed)})
@@ -52,19 +48,3 @@ class Session:
         self._transport.close()
         if self.log:
             self.log.close()
-
-    def line(self, loop: RealTimeLoop) -> str:
-        """Return the state in a line: mode, command, torques against limits, temperature, ticks, messages."""
-        controller, state = self.controller, self.controller.state
-        parts = [controller.mode.value + (f" ({controller.reason})" if controller.reason else "")]
-        parts.append("command " + " ".join(f"{part:+.2f}" for part in controller.velocity_command))
-        if state is not None:
-            limits = np.abs(controller.joints.torque_limits).max(axis=0)
-            share = np.abs(torques_of(controller.sent, state)) / limits
-            worst = int(np.argmax(share))
-            parts.append(f"torque {share[worst]:.0%} of {controller.joints.names[worst]}'s limit")
-            parts.append(f"motors {state.temperatures.max():.0f} deg C")
-        parts.append(f"ticks {loop.ticks}, 99.9% within {1e3 * loop.lateness(0.999):.2f} ms")
-        parts += [self.log.problem] if self.log and self.log.problem else []
-        parts += [f"{name} {count}" for name, count in self.counts.items() if count and name != "messages"]
-        return "; ".join(parts)

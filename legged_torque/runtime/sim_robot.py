@@ -8,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from legged_torque.deploy.ground import place_ground
 from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
@@ -54,7 +55,6 @@ class SimRobot:
         xml: Path,
         joint_order: list[str],
         rate: float,
-        seed: int = 0,
         motors: MotorsCfg | None = None,
         latency: float = 0.0,
         hangs: bool = False,
@@ -69,8 +69,7 @@ class SimRobot:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
         with loading(xml):
             spec = mujoco.MjSpec.from_file(str(xml))
-            floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], name="runtime floor")
-            floor.contype = floor.conaffinity = 1
+            place_ground(spec, {}, [])
             spec.option.timestep = STEP
             self.model = spec.compile()
         self.data, self.joint_order = mujoco.MjData(self.model), joint_order
@@ -87,7 +86,7 @@ class SimRobot:
             hang_up(self.model)
         self._lift = -hangs * self.model.body_mass[1] * self.model.opt.gravity  # [N]
         self._latency, self._on_their_way = latency, deque[tuple[float, MotorCommand]]()
-        self._rng, self.faults = np.random.default_rng(seed), Faults()
+        self._rng, self.faults = np.random.default_rng(0), Faults()
         self.watchdog_ticks, self.excess, self.is_damping = 0, 0.0, True
         self._command: MotorCommand | None = None
         self._age, self._tick = np.inf, 0
@@ -107,8 +106,7 @@ class SimRobot:
 
     def step(self, received: Received) -> None:
         """Move on for the time between two messages, under the newest command."""
-        period = self._steps * STEP
-        self._age += period
+        self._age += self._steps * STEP
         if isinstance(received.newest, MotorCommand):
             self._on_their_way.append((self.data.time + self._latency, received.newest))
             self._age = 0.0
@@ -147,21 +145,12 @@ class SimRobot:
 
     def says(self) -> tuple[RobotState | None, bool]:
         """Return the next message, or none if it is lost or late, and whether it is to be damaged on its way."""
-        faults, names = self.faults, np.array(self.joint_order)
+        faults, names, qpos, qvel = self.faults, np.array(self.joint_order), self.data.qpos, self.data.qvel
         self._tick += 1
-        positions = self.data.qpos[self._qpos].copy()
-        if faults.not_finite:
-            positions[0] = np.nan
-        state = RobotState(
-            tick=self._tick,
-            quaternion=self.data.qpos[3:7].copy(),
-            angular_velocity=self.data.qvel[3:6].copy(),
-            joint_positions=positions,
-            joint_velocities=self.data.qvel[self._dofs].copy(),
-            joint_torques=self._applied.copy(),
-            temperatures=np.where(np.isin(names, faults.hot), 120.0, 40.0),
-            errors=np.isin(names, faults.error).astype(int),
-        )
+        trunk, joints = (qpos[3:7].copy(), qvel[3:6].copy()), (qpos[self._qpos], qvel[self._dofs], self._applied.copy())
+        joints[0][:1] += np.nan if faults.not_finite else 0.0
+        hot, errors = np.isin(names, faults.hot), np.isin(names, faults.error)
+        state = RobotState(self._tick, *trunk, *joints, np.where(hot, 120.0, 40.0), errors.astype(int))
         self._late.append((self.data.time + faults.delay, state))
         if faults.silent or self._rng.random() < faults.lost:
             self._late.pop()

@@ -12,27 +12,19 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
 from numpy.typing import ArrayLike
 
-from legged_torque.runtime.interface import MotorCommand, RobotState
+from legged_torque.runtime.interface import JOINT_ORDER, NO_POSITION, NO_VELOCITY, MotorCommand, RobotState
 
-JOINT_ORDER = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
 SLOTS = 20  # motors in a message; those after the legs' 12 are idle
 HEAD = (0xFE, 0xEF)
 UNSET = (0, 0)  # unitree_mujoco sets neither the head nor the modes of its states
 LOW_LEVEL = 0xFF
 SERVO = 0x01  # mode of a motor
-NO_POSITION = 2.146e9  # as q: the drive holds no position
-NO_VELOCITY = 16000.0  # as dq: the drive damps nothing
 COMMANDED = ("tau", "q", "dq", "kp", "kd")
-MEASURED = {
-    "joint_positions": "q",
-    "joint_velocities": "dq",
-    "joint_torques": "tau_est",
-    "temperatures": "temperature",
-}
+MEASURED = {"joint_positions": "q", "joint_velocities": "dq", "joint_torques": "tau_est", "temperatures": "temperature"}
 """What RobotState calls the members of a motor's state."""
 STATE_PERIOD = 2  # ms: a Go2 tells its state 500 times a second, and ``tick`` counts milliseconds
 
@@ -43,6 +35,15 @@ class MessageError(Exception):
 
 class CrcError(MessageError):
     """A message that was damaged on its way."""
+
+
+def _zeros(name: str, **members: Any) -> Any:
+    """Return a type whose numbers are 0 at first, of types by member; an array's have a type and a length."""
+    kinds = {member: array[kind] if isinstance(kind, tuple) else kind for member, kind in members.items()}
+    struct = make_idl_struct(name, f"unitree_go.msg.dds_.{name}", kinds, dataclassify=False)
+    for member, kind in members.items():
+        setattr(struct, member, (0,) * kind[1] if isinstance(kind, tuple) else 0)
+    return dataclass(struct)
 
 
 @dataclass
@@ -58,12 +59,7 @@ class MotorCmd_(IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
     reserve: array[uint32, 3] = (0,) * 3
 
 
-@dataclass
-class BmsCmd_(IdlStruct, typename="unitree_go.msg.dds_.BmsCmd_"):
-    """Command of the battery."""
-
-    off: uint8 = 0
-    reserve: array[uint8, 3] = (0,) * 3
+BmsCmd_ = _zeros("BmsCmd_", off=uint8, reserve=(uint8, 3))
 
 
 @dataclass
@@ -89,50 +85,13 @@ class LowCmd_(IdlStruct, typename="unitree_go.msg.dds_.LowCmd_"):
     crc: uint32 = 0
 
 
-@dataclass
-class IMUState_(IdlStruct, typename="unitree_go.msg.dds_.IMUState_"):
-    """What the trunk measures."""
-
-    quaternion: array[float32, 4] = (0,) * 4
-    gyroscope: array[float32, 3] = (0,) * 3
-    accelerometer: array[float32, 3] = (0,) * 3
-    rpy: array[float32, 3] = (0,) * 3
-    temperature: uint8 = 0
-
-
-@dataclass
-class MotorState_(IdlStruct, typename="unitree_go.msg.dds_.MotorState_"):
-    """State of one drive.
-
-    Unitree names no error flags for Go2; here they are ``reserve[0]``.
-    """
-
-    mode: uint8 = SERVO
-    q: float32 = 0.0
-    dq: float32 = 0.0
-    ddq: float32 = 0.0
-    tau_est: float32 = 0.0
-    q_raw: float32 = 0.0
-    dq_raw: float32 = 0.0
-    ddq_raw: float32 = 0.0
-    temperature: uint8 = 0
-    lost: uint32 = 0
-    reserve: array[uint32, 2] = (0,) * 2
-
-
-@dataclass
-class BmsState_(IdlStruct, typename="unitree_go.msg.dds_.BmsState_"):
-    """State of the battery."""
-
-    version_high: uint8 = 0
-    version_low: uint8 = 0
-    status: uint8 = 0
-    soc: uint8 = 0
-    current: int32 = 0
-    cycle: uint16 = 0
-    bq_ntc: array[uint8, 2] = (0,) * 2
-    mcu_ntc: array[uint8, 2] = (0,) * 2
-    cell_vol: array[uint16, 15] = (0,) * 15
+_TRUNK = {"quaternion": (float32, 4), "gyroscope": (float32, 3), "accelerometer": (float32, 3), "rpy": (float32, 3)}
+IMUState_ = _zeros("IMUState_", **_TRUNK, temperature=uint8)
+_MOTOR = dict.fromkeys(("q", "dq", "ddq", "tau_est", "q_raw", "dq_raw", "ddq_raw"), float32)
+MotorState_ = _zeros("MotorState_", mode=uint8, **_MOTOR, temperature=uint8, lost=uint32, reserve=(uint32, 2))
+"""Unitree names no error flags for Go2; here they are ``reserve[0]``."""
+_BATTERY = dict.fromkeys(("version_high", "version_low", "status", "soc"), uint8) | {"current": int32, "cycle": uint16}
+BmsState_ = _zeros("BmsState_", **_BATTERY, bq_ntc=(uint8, 2), mcu_ntc=(uint8, 2), cell_vol=(uint16, 15))
 
 
 @dataclass
@@ -146,7 +105,7 @@ class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
     version: array[uint32, 2] = (0,) * 2
     bandwidth: uint16 = 0
     imu_state: IMUState_ = field(default_factory=IMUState_)
-    motor_state: array[MotorState_, SLOTS] = field(default_factory=lambda: [MotorState_() for _ in range(SLOTS)])
+    motor_state: array[MotorState_, SLOTS] = field(default_factory=lambda: [MotorState_(SERVO) for _ in range(SLOTS)])
     bms_state: BmsState_ = field(default_factory=BmsState_)
     foot_force: array[int16, 4] = (0,) * 4
     foot_force_est: array[int16, 4] = (0,) * 4
@@ -163,12 +122,16 @@ class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
     crc: uint32 = 0
 
 
-_HEADER = "<4B4IH2x"
-_LAYOUTS = {
-    LowCmd_: struct.Struct(_HEADER + "B3x5f3I" * SLOTS + "4B" + "55Bx2I"),
-    LowState_: struct.Struct(_HEADER + "13fB3x" + "B3x7fB3x3I" * SLOTS + "4BiH4B15H" + "8hI41B3xf2B2x2f4H2I"),
+_FORMATS: dict[type, str] = {
+    LowCmd_: "<4B4IH2x" + "B3x5f3I" * SLOTS + "4B55Bx2I",
+    LowState_: "<4B4IH2x" + "13fB3x" + "B3x7fB3x3I" * SLOTS + "4BiH4B15H8hI41B3xf2B2x2f4H2I",
 }
 """The messages as C structures, little endian: 812 and 1180 bytes, the last four of which are the CRC."""
+_LAYOUTS = {kind: struct.Struct(text) for kind, text in _FORMATS.items()}
+_UNPADDED = {kind: text.replace("H2xB3x", "HBx").replace("B3xB3x", "BB2x") for kind, text in _FORMATS.items()}
+_WIRE = {kind: struct.Struct(text) for kind, text in _UNPADDED.items()}
+"""The same in DDS's own form, CDR, which begins with _CDR and has less padding."""
+_CDR = b"\0\1\0\0"
 _REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _MEMBERS = {
     kind: attrgetter(*(member.name for member in fields(kind)))
@@ -189,6 +152,31 @@ def _numbers(part: IdlStruct) -> Iterator[Any]:
                 yield from _numbers(inner)
         else:
             yield from value
+
+
+def _filled(blank: Any, numbers: Iterator[Any]) -> Any:
+    """Return a message like a blank one, or a part of it, with numbers in order."""
+    if isinstance(blank, (int, float)):
+        return next(numbers)
+    if isinstance(blank, IdlStruct):
+        return type(blank)(*[_filled(member, numbers) for member in _MEMBERS[type(blank)](blank)])
+    return [_filled(each, numbers) for each in blank]
+
+
+def _serialize(self: Any, use_version_2: bool | None = None) -> bytes:
+    """Do what cyclonedds does in Python, in a fourth of the time."""
+    return _CDR + _WIRE[type(self)].pack(*_numbers(self))
+
+
+def _deserialize(kind: Any, data: bytes) -> Any:
+    """Do what cyclonedds does in Python, in a third of the time; or leave other forms of CDR to it."""
+    if data[:2] != _CDR[:2] or len(data) < len(_CDR) + _WIRE[kind].size:
+        return kind.__idl__.deserialize(data)
+    return _filled(kind(), iter(_WIRE[kind].unpack_from(data, len(_CDR))))
+
+
+for _kind in _WIRE:
+    _kind.serialize, _kind.deserialize = _serialize, classmethod(_deserialize)
 
 
 def packed(message: LowCmd_ | LowState_) -> bytes:
@@ -231,14 +219,9 @@ def _check(message: LowCmd_ | LowState_, modes: list[int]) -> None:
 
 
 def encode_command(command: MotorCommand, number: int) -> LowCmd_:
-    """Return the message of a command.
+    """Return the message of a command of the joints in JOINT_ORDER, in float32, with a number below 2 ** 32.
 
-    Args:
-        command: Of the joints in JOINT_ORDER; rounded to float32.
-        number: Of the message, below 2 ** 32.
-
-    Raises:
-        MessageError: If a number is not finite, or there are not twelve.
+    Raises MessageError if a value is not finite, or there are not twelve.
     """
     message = LowCmd_(reserve=number)
     columns = [_finite(name, getattr(command, name)) for name in COMMANDED]
@@ -258,13 +241,9 @@ def decode_command(message: LowCmd_) -> MotorCommand:
 
 
 def encode_state(state: RobotState) -> LowState_:
-    """Return the message of a state.
+    """Return the message of a state of the joints in JOINT_ORDER, in float32, temperatures in whole degrees, 0 to 255.
 
-    Args:
-        state: Of the joints in JOINT_ORDER; rounded to float32, temperatures to whole degrees from 0 to 255.
-
-    Raises:
-        MessageError: If a number is not finite, or there are not as many as RobotState says.
+    Raises MessageError if a number is not finite, or there are not as many as RobotState says.
     """
     message = LowState_(tick=state.tick * STATE_PERIOD % 2**32)
     message.imu_state.quaternion = _finite("quaternion", state.quaternion, 4).tolist()

@@ -28,6 +28,8 @@ class Sensing:
         self._measured = 0
         times, jitter, unit_steps = cfg.counted("sensing.delay", dt, decimation)
         self.queue = PacketQueue(self._packet(), 1, times, unit_steps, jitter, cfg.loss)
+        is_regular = not jitter and not cfg.loss
+        self._first = max(decimation - 1 - self.queue.depth, 0) if is_regular else 0  # that can still be the newest
         self._arrived = torch.zeros_like(self._packet())
         parts = self._arrived.split((4, num_dof, 3, num_dof), dim=1)
         self._quat, self.dof_pos, self.base_ang_vel, self.dof_vel = parts
@@ -39,8 +41,9 @@ class Sensing:
         self.queue.draw()
 
     def measure(self) -> None:
-        """Measure at the end of a physics step."""
-        self.queue.send(self._orientation_and_joints, self._velocities, self._measured)
+        """Measure at the end of a physics step, unless no policy will see it."""
+        if self._measured >= self._first:
+            self.queue.send(self._orientation_and_joints, self._velocities, self._measured)
         self._measured += 1
 
     def begin_episodes(self, is_new: Tensor) -> None:

@@ -26,7 +26,11 @@ SETTINGS: dict[str, Any] = {
         "triton.autotune_pointwise": False,
     },
 }
-"""Arguments of ``torch.compile``."""
+"""Arguments of ``torch.compile``, for operations of a number per world."""
+NETWORK_SETTINGS = SETTINGS | {
+    "options": SETTINGS["options"] | {"aggressive_fusion": False, "combo_kernels": False, "compile_threads": 8}
+}
+"""The same for networks, whose combined kernels compile for minutes, or need more memory than a processor has."""
 FIRST_TORCH = (2, 10)  # whose compiler promises the same bits in every process ("deterministic")
 MOST_VERSIONS = 256  # of a function: one per task in the process, and per Python number that it reads
 
@@ -46,8 +50,8 @@ def can_compile(device: str) -> bool:
 def compiled(function: Callable, device: str, learns: bool = False) -> Callable:
     """Return a function that does the same with few kernels; the function itself where it cannot be compiled.
 
-    It must only run operations of torch. What it keeps are tensors with fixed addresses, written in place. Its results
-    have gradients if it ``learns``.
+    It must only run operations of torch. What it keeps are tensors with fixed addresses, written in place. If it
+    ``learns``, it is of networks, and its results have gradients.
     It is compiled at the first call, once per machine: the kernels are kept in a folder of Warp's cache. Where that
     is not possible, a line on standard error says so and names the place, and the function runs as it is.
     """
@@ -63,7 +67,8 @@ class Compiled:
 
         keep_kernels()
         dynamo.config.recompile_limit = max(dynamo.config.recompile_limit, MOST_VERSIONS)
-        self._function, self._run, self._has_run = function, torch.compile(function, **SETTINGS), False
+        settings = NETWORK_SETTINGS if learns else SETTINGS
+        self._function, self._run, self._has_run = function, torch.compile(function, **settings), False
         self._learns = learns
 
     def __call__(self, *args: Any) -> Any:

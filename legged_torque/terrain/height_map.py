@@ -36,17 +36,6 @@ class HeightMap(HeightGrid):
 
     def height_at(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the same for x and y by themselves, which a GPU need not write for that [m]. Shapes: (...,)."""
-        low, slope_x, slope_y, x, y = self._triangle(x, y)
-        return low + slope_x * x + slope_y * y
-
-    def normal(self, points: Tensor) -> Tensor:
-        """Return the upward unit normal of the triangle at x and y of points. Shapes: (..., 2 or more) to (..., 3)."""
-        _, slope_x, slope_y, _, _ = self._triangle(points[..., 0], points[..., 1])
-        upwards = torch.full_like(slope_x, self.horizontal_scale)
-        return torch.nn.functional.normalize(torch.stack([-slope_x, -slope_y, upwards], dim=-1), dim=-1)
-
-    def _triangle(self, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return height at a cell's corner, rises of its triangle in x and y per cell [m], and x, y in cells."""
         rows, cols = self.heights.shape
         row, x = self._along(x, self.corner[0], rows)
         col, y = self._along(y, self.corner[1], cols)
@@ -55,7 +44,8 @@ class HeightMap(HeightGrid):
         low = self._sample(corner, x)
         third = self._sample(corner + torch.where(is_along_x, cols, 1), x)
         first, second = third - low, self._sample(corner + (cols + 1), x) - third
-        return low, torch.where(is_along_x, first, second), torch.where(is_along_x, second, first), x, y
+        slope_x, slope_y = torch.where(is_along_x, first, second), torch.where(is_along_x, second, first)
+        return low + slope_x * x + slope_y * y
 
     def _along(self, place: Tensor, start: float, count: int) -> tuple[Tensor, Tensor]:
         """Return in which cell of an axis places are, and where in it, from 0 to 1."""

@@ -3,14 +3,13 @@
 import math
 from typing import Any
 
-import mujoco
 import torch
 from torch import Tensor
 
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
 
 COPIES, BYTES = 3.25, 4
 """Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell, and near each block
@@ -48,23 +47,6 @@ class RoughGround(Terrain):
         self._curriculum: bool = settings.curriculum
         self.levels = worlds % (settings.max_init_terrain_level + 1 if self._curriculum else layout.num_rows)
 
-    @classmethod
-    def build(cls, settings: Any, num_envs: int, device: str) -> "RoughGround":
-        """Make the ground of a section ``terrain``; errors of the constructor."""
-        return cls(settings, num_envs, device)
-
-    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
-        """Make the floor a height field."""
-        self.map.add_to(spec, floor)
-
-    def height(self, points: Tensor) -> Tensor:
-        """Return the height of the surface."""
-        return self.map.height(points)
-
-    def normal(self, points: Tensor) -> Tensor:
-        """Return the normal of the surface's triangle."""
-        return self.map.normal(points)
-
     @property
     def origins(self) -> Tensor:
         """Middle of the tile of each world [m]. Shape: (num_envs, 3)."""
@@ -97,3 +79,14 @@ class RoughGround(Terrain):
     def curriculum_values(self) -> dict[str, Tensor]:
         """Return the mean level of all worlds."""
         return {"terrain_level": self.levels.float().mean()}
+
+
+TERRAINS: dict[str, type[Terrain]] = {"plane": Terrain, "heightfield": RoughGround}
+"""Kinds of ground, by ``terrain.mesh_type``."""
+
+
+def make_terrain(settings: Any, num_envs: int, device: str) -> Terrain:
+    """Return the ground that a section ``terrain`` of settings asks for; a UserError if there is no such ground."""
+    if settings.mesh_type not in TERRAINS:
+        raise unknown_name("terrain.mesh_type", settings.mesh_type, TERRAINS)
+    return TERRAINS[settings.mesh_type](settings, num_envs, device)

@@ -1,4 +1,4 @@
-"""The interface of grounds, and the plane. All points are in the world frame [m]; nothing here waits for the host."""
+"""The interface of grounds, which is also the plane. All points are in the world frame [m]."""
 
 from typing import Any
 
@@ -10,31 +10,30 @@ from legged_torque.terrain.height_map import HeightMap
 
 
 class Terrain:
-    """The ground under all worlds. By default episodes start at the world's origin, and nothing changes with them."""
+    """The ground under all worlds: a plane at z = 0, on which every world starts at the origin, and nothing changes.
+
+    Another ground is a subclass in :data:`~legged_torque.terrain.rough.TERRAINS`. Only the constructor may wait for the
+    host.
+    """
 
     map: HeightMap | None = None
     """Its surface, unless it is a plane."""
 
-    @classmethod
-    def build(cls, settings: Any, num_envs: int, device: str) -> "Terrain":
-        """Return the ground for a section ``terrain`` of settings, which :class:`Plane` does not need."""
-        return cls()
+    def __init__(self, settings: Any, num_envs: int, device: str) -> None:
+        """Make the ground of a section ``terrain`` of settings, which the plane does not need."""
 
     def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
-        """Put this ground into a robot's MJCF in place of its plane, the geom ``floor`` of the world."""
-        raise NotImplementedError(f"{type(self).__name__} has no add_to")
+        """Put the map, if there is one, into a robot's MJCF in place of its plane, the geom ``floor`` of the world."""
+        if self.map:
+            self.map.add_to(spec, floor)
 
     def height(self, points: Tensor) -> Tensor:
         """Return the height of the ground at x and y of points [m]. Shapes: (..., 3) to (...,)."""
-        raise NotImplementedError(f"{type(self).__name__} has no height")
-
-    def normal(self, points: Tensor) -> Tensor:
-        """Return the unit normal of the ground under points, upwards. Shapes: (..., 3)."""
-        raise NotImplementedError(f"{type(self).__name__} has no normal")
+        return self.map.height(points) if self.map else torch.zeros_like(points[..., 2])
 
     def height_above(self, points: Tensor) -> Tensor:
         """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""
-        return points[..., 2] - self.height(points)
+        return points[..., 2] - self.map.height(points) if self.map else points[..., 2]
 
     def move_to_origin(self, mask: Tensor, base_pos: Tensor) -> None:
         """Move trunks, placed as if the world's origin were 0, to where episodes of their worlds start.
@@ -56,24 +55,3 @@ class Terrain:
     def state_dict(self) -> dict[str, Tensor]:
         """Return what differs between worlds and changes from episode to episode."""
         return {}
-
-
-class Plane(Terrain):
-    """A plane at z = 0, on which every world starts at the origin."""
-
-    def add_to(self, spec: mujoco.MjSpec, floor: str) -> None:
-        """Leave the robot's own plane."""
-
-    def height(self, points: Tensor) -> Tensor:
-        """Return 0 for each point."""
-        return torch.zeros_like(points[..., 2])
-
-    def normal(self, points: Tensor) -> Tensor:
-        """Return (0, 0, 1) for each point."""
-        normal = torch.zeros_like(points)
-        normal[..., 2] = 1.0
-        return normal
-
-    def height_above(self, points: Tensor) -> Tensor:
-        """Return z, without a kernel."""
-        return points[..., 2]

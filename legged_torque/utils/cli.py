@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import dataclasses
 import gc
-import importlib.util
 import os
 import re
 import shutil
@@ -20,7 +19,7 @@ from typing import Any, NoReturn
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.config import flat, section_keys, to_dict
 from legged_torque.utils.devices import disable_renderer
-from legged_torque.utils.errors import TrainingError, UserError, has_lost_process, is_out_of_memory, unknown_name
+from legged_torque.utils.errors import LOST_PROCESS, TrainingError, UserError, is_out_of_memory, unknown_name
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import Rate, check_value, describe, types_of
 from legged_torque.utils.options import DEFAULT_TASK, Options
@@ -192,8 +191,6 @@ def options_of(args: argparse.Namespace) -> Options:
     options = Options(**{name: getattr(args, name) for name in names if hasattr(args, name)})
     if options.task_file:
         with slow_imports():
-            if os.environ.get("MUJOCO_GL") == "osmesa" and importlib.util.find_spec("triton"):
-                importlib.import_module("triton")  # after MuJoCo, it crashes: it and OSMesa have different LLVMs
             task_registry.import_files(options.task_file)
     return options
 
@@ -263,8 +260,8 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         elif is_out_of_memory(error):
             reason = (str(error).strip() or "no reason is given").splitlines()[0]
             message = f"this does not fit in memory, lower --num_envs: {reason}"
-        elif has_lost_process(error):
-            message = "another process of this training has ended; --resume goes on from the last checkpoint"
+        elif isinstance(error, RuntimeError) and "gloo" in str(error):
+            message = LOST_PROCESS
         else:
             raise
         status, line = 2, f"error: {message}"

@@ -2,13 +2,16 @@
 
 import contextlib
 import copy
+import functools
 import inspect
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import yaml
 
 from legged_torque.utils.errors import UserError, collect_errors, refuse, unknown_name
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
-from legged_torque.utils.successors import successor
 
 
 class Section:
@@ -126,6 +129,18 @@ class BaseConfig(Section):
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
         """Return the settings of an earlier run, as nested dictionaries, in today's layout."""
         return values
+
+
+@functools.cache
+def successors(kind: Literal["settings", "methods", "attributes"]) -> dict[str, str]:
+    """Return the replacements, in words, of names of legged_gym and of earlier versions; settings are dotted paths."""
+    return yaml.safe_load(Path(__file__).with_name("successors.yaml").read_text("utf-8"))[kind]
+
+
+def successor(kind: Literal["settings", "methods", "attributes"], name: str) -> str:
+    """Return a sentence with the replacement of a name; empty for names that never existed."""
+    new = successors(kind).get(name)
+    return f"'{name}' is now {new}" if new else ""
 
 
 def section_keys(section: Any) -> list[str]:

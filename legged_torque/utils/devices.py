@@ -2,6 +2,7 @@
 
 import contextlib
 import ctypes.util
+import importlib.util
 import math
 import os
 import re
@@ -111,6 +112,8 @@ def choose_offscreen_renderer() -> str | None:
     for name in candidates:
         if ctypes.util.find_library(_LIBRARIES[name]):
             os.environ["MUJOCO_GL"] = name
+            if name == "osmesa" and importlib.util.find_spec("triton"):
+                importlib.import_module("triton")  # after MuJoCo, it crashes: it and OSMesa have different LLVMs
             return None
     disable_renderer()
     return f"the library of {' or '.join(candidates)} is not installed ({INSTALL_HINT})"

@@ -106,7 +106,7 @@ class Display:
         if is_terminal(self._stream) and Display.shown is None:
             Display.shown = self
             self._console = Console(file=self._stream, highlight=False, markup=False)
-            self._live = _Live(
+            self._live = Live(
                 console=self._console,
                 refresh_per_second=1.0 / REDRAW_EVERY,
                 transient=not self._stays,
@@ -157,15 +157,6 @@ class Display:
             return Text(f"nothing to see: {type(error).__name__}: {error}")
 
 
-class _Live(Live):
-    """A view that is not redrawn any more when its terminal is gone."""
-
-    def refresh(self) -> None:
-        """Redraw."""
-        with contextlib.suppress(OSError):
-            super().refresh()
-
-
 class _Times(ProgressColumn):
     """The column with the share that is done, and :func:`times`."""
 
@@ -195,13 +186,9 @@ class Counter(Display):
 
 
 def times(task: Task) -> str:
-    """Return the times spent and left, "0:00:01, 0:00:03 left"; a field "left" of the task replaces rich's estimate."""
-    return f"{duration(task.elapsed or 0.0)}, {time_left_text(task.fields.get('left', task.time_remaining))}"
-
-
-def time_left_text(left: float | None) -> str:
-    """Return the time left [s] in words; None is unknown."""
-    return _UNKNOWN if left is None else f"{duration(left)} left"
+    """Return the times spent and left: "0:00:01, 0:00:03 left"."""
+    left = task.time_remaining
+    return f"{duration(task.elapsed or 0.0)}, {_UNKNOWN if left is None else f'{duration(left)} left'}"
 
 
 def read_progress(text: str) -> tuple[str, int, int, str] | None:

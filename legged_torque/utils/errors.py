@@ -1,4 +1,4 @@
-"""Errors that a user can act on."""
+"""Errors that a user can act on, and the words of messages."""
 
 import contextlib
 import difflib
@@ -8,11 +8,17 @@ OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
 MANY = 40  # names, of which an error lists only the nearest
 NEAREST = 5  # how many those are
+LOST_PROCESS = "another process of this training has ended; --resume goes on from the last checkpoint"
 
 
 def printable(text: object) -> str:
     """Return a text with codes in place of characters such as line ends, with which names could change a terminal."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number of things in words: "1 fall", "2,000 falls"."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
 
 
 class UserError(Exception):
@@ -64,15 +70,6 @@ def collect_errors(problems: list[str]) -> Iterator[None]:
         yield
     except UserError as error:
         problems.append(str(error))
-
-
-class LostProcessError(RuntimeError):
-    """A process has ended with which this one trains."""
-
-
-def has_lost_process(error: Exception) -> bool:
-    """Return whether an error says that a process has ended with which this one exchanges tensors on a CPU."""
-    return isinstance(error, LostProcessError) or (isinstance(error, RuntimeError) and "gloo" in str(error))
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:

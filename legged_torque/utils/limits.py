@@ -18,7 +18,7 @@ from legged_torque.utils.errors import UserError, unknown_name
 LARGEST = 1e9  # absolute value of a float; squares of larger ones leave float32
 LARGEST_INT = 2**63 - 1  # absolute value of an integer, that of int64
 _NAMES = {float: "a number", int: "an integer", str: "text", bool: "true or false", types.NoneType: "null"}
-_PLURALS = {float: "numbers", int: "integers", str: "texts", list[str]: "lists of texts"}
+_PLURALS = {float: "numbers", int: "integers", str: "texts", list[str]: "lists of texts", Any: "values"}
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ def check_value(name: str, value: Any, hint: Any) -> Any:
                 raise UserError(f"{name} must be {size}, not {value}")
             if kind(value) == value:
                 return kind(value)
-    elif value in parts if kind is Literal else not isinstance(kind, type) or isinstance(value, kind):
-        return value  # of a kind that is not a type, such as Any, everything is
+    elif value in parts if kind is Literal else kind is Any or not isinstance(kind, type) or isinstance(value, kind):
+        return value  # of a kind that is not a type, everything is
     raise UserError(f"{name} must be {describe(hint) or hint}, not {value!r}")
 
 

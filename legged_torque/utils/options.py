@@ -5,11 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from legged_torque.utils.config import section_keys, set_by_path, update_from_dict
+from legged_torque.utils.config import section_keys, set_by_path, successor, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
-from legged_torque.utils.successors import successor
 
 DEFAULT_PRESET = "parallel"
 CPU_PRESET = "laptop"  # chosen where there is no GPU

@@ -13,7 +13,7 @@ from typing import TextIO
 import warp as wp
 
 from legged_torque.utils.display import LINE_EVERY, Display
-from legged_torque.utils.words import counted
+from legged_torque.utils.errors import counted
 
 COMPILING = "compiling kernels, once per machine"
 SHOW_AFTER = 2.0  # seconds of compilation before it is reported

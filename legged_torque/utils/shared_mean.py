@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from legged_torque.utils.errors import LostProcessError
+from legged_torque.utils.errors import LOST_PROCESS, UserError
 
 _ADDRESS, _KEY = "LEGGED_TORQUE_ADDRESS", "LEGGED_TORQUE_KEY"
 """Environment variables: where the first process listens, and what the others must know to be heard."""
@@ -80,4 +80,4 @@ class SharedMean:
                 for other in self._others:
                     other.send_bytes(b"go on")
         except (EOFError, OSError) as error:
-            raise LostProcessError("another process of this training has ended") from error
+            raise UserError(LOST_PROCESS) from error

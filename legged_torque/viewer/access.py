@@ -22,7 +22,7 @@ from viser._messages import GuiUpdateMessage, Message
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
-from legged_torque.viewer.ports import free_port
+from legged_torque.viewer.training_viewer import free_port
 
 MAX_MESSAGE = 2**16  # bytes of a message from a browser; longer ones end the connection
 LOGGERS = ("asyncio", "websockets.server")  # quote what clients send wrong, which could fill the disk

@@ -13,8 +13,6 @@ import mujoco
 import numpy as np
 
 from legged_torque import resource_path
-from legged_torque.terrain.colors import NEUTRAL, color_of
-from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.mjcf import loading, read_spec
 
@@ -34,6 +32,23 @@ COMMAND_COLOR, VELOCITY_COLOR = (0.1, 0.8, 0.2, 0.9), (0.1, 0.4, 1.0, 0.9)
 ARROW_RADIUS = 0.012  # of an arrow's shaft [m]
 
 RESOLUTION, MAX_PIXELS = 32.0, 4096  # of the picture: pixels per metre, and limit along a side
+NEUTRAL = (206, 208, 210)
+"""Of level ground, and of what lies around the tiles. Each color is red, green and blue, up to 255."""
+COLORS = {
+    "flat": NEUTRAL,
+    "smooth_slope_up": (176, 203, 164),
+    "smooth_slope_down": (143, 186, 158),
+    "rough_slope": (199, 193, 143),
+    "stairs_up": (151, 186, 213),
+    "stairs_down": (172, 172, 217),
+    "discrete_obstacles": (222, 177, 148),
+    "waves": (140, 200, 198),
+    "stepping_stones": (207, 166, 198),
+    "gaps": (224, 160, 160),
+    "pits": (228, 207, 140),
+}
+"""Of kinds of tiles: calm ones, on which dark robots are seen well."""
+OWN = (204, 190, 214)  # of kinds that users have added
 SHADES = (1.0, 0.94, 0.85)  # brightness of a tile, of lines on it that are 1 m apart, and of its edges
 LINE_WIDTH = 1.2  # of lines and edges [pixels]
 STRAIGHT = 1e-6  # largest bend between neighbouring samples of a straight line [m]
@@ -62,7 +77,7 @@ class Drawing:
     def of_task(cls, task: LeggedRobot) -> Drawing:
         """Return the robot of a task on its ground, with the joints in the task's order."""
         terrain: Any = task.terrain  # rough ground if it has a map
-        ground = Ground(terrain.layout, terrain.map) if terrain.map else None
+        ground = Ground(terrain.layout) if terrain.map else None
         return cls(drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground)
 
     def move(self, qpos: np.ndarray) -> None:
@@ -144,17 +159,16 @@ class Ground:
         faces: The triangles, counterclockwise as seen from above. Shape: (triangles, 3), int32.
     """
 
-    def __init__(self, layout: Layout, grid: HeightGrid) -> None:
-        """Divide a grid of heights with this layout into triangles."""
+    def __init__(self, layout: Layout) -> None:
+        """Divide the map of a layout into triangles."""
         self.layout = layout
-        self._heights, self._scale = grid.heights, grid.horizontal_scale
-        self._corner, size = np.array(grid.corner), np.array(grid.size)
+        self._heights, self._scale, self._corner = layout.heights(), layout.horizontal_scale, np.array(layout.corner)
         rectangles = patches(self._heights)
         rows, cols = rectangles[:, [0, 1, 1, 0]], rectangles[:, [2, 2, 3, 3]]
         samples, corners = np.unique(rows * self._heights.shape[1] + cols, return_inverse=True)
         places = np.stack(np.unravel_index(samples, self._heights.shape), axis=1) * self._scale
         self.vertices = np.column_stack([places + self._corner, self._heights.flat[samples]]).astype(np.float32)
-        self.uv = (places / size).astype(np.float32)
+        self.uv = (places / places.max(axis=0)).astype(np.float32)
         self._rectangles = corners.reshape(rows.shape)
         self.faces = self._rectangles[:, [0, 1, 2, 0, 2, 3]].astype(np.int32).reshape(-1, 3)
 
@@ -171,7 +185,7 @@ class Ground:
             is_line, is_edge = (np.abs((place + 0.5 * step) % step - 0.5 * step) < half for step in steps)
             tiles.append(np.floor(place / layout.tile_size).astype(int))
             shades.append(np.where(is_edge, 2, is_line.astype(int)))
-        colors = np.array([*(color_of(kind) for kind in layout.kinds()), NEUTRAL])
+        colors = np.array([*(COLORS.get(kind, OWN) for kind in layout.kinds()), NEUTRAL])
         is_row = (tiles[0] >= 0) & (tiles[0] < layout.num_rows)
         is_col = (tiles[1] >= 0) & (tiles[1] < layout.num_cols)
         column = np.where(is_row & is_col[:, None], tiles[1][:, None], layout.num_cols)

@@ -1,7 +1,9 @@
 """The page and the videos of a running training, made from its checkpoints by low-priority processes on the CPU."""
 
 import contextlib
+import errno
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -10,10 +12,9 @@ from pathlib import Path
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.display import warn
+from legged_torque.utils.distributed import ending_with_parent
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.processes import ending_with_parent
 from legged_torque.utils.runs import checkpoint_number
-from legged_torque.viewer.ports import free_port
 
 EXTRAS = {"viewer": ("viser", "trimesh"), "video": ("imageio", "imageio_ffmpeg", "PIL")}
 HOST, PORT = "127.0.0.1", 8080  # of the page, or the next free port
@@ -113,3 +114,16 @@ def end(process: subprocess.Popen[bytes]) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first free port from a port on; a UserError for an address that is not this machine's."""
+    for candidate in range(port, 65536):
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            with socket.create_server((host, candidate), family=family):
+                return candidate
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:  # viser would try all ports forever
+                raise UserError(f"cannot serve at {host}:{candidate}: {error.strerror or error}") from None
+    raise UserError(f"no port from {port} on is free")

@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy.simulation import Simulation
-from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
@@ -116,8 +115,7 @@ class SimulationRecorder(VideoRecorder):
         robot, description = simulation.robot, simulation.policy.description
         ground, model = None, robot.model
         if "terrain" in description and model.nhfield:
-            layout = Layout(**description["terrain"])
-            ground = Ground(layout, HeightGrid(layout.heights(), layout.horizontal_scale, layout.corner))
+            ground = Ground(Layout(**description["terrain"]))
             model = drawn_model(robot.file, ground)
         super().__init__(Drawing(model, ground, robot.trunk), 1.0 / description["timing"]["control_frequency"])
         self._simulation = simulation

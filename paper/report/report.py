@@ -25,9 +25,8 @@ from legged_torque.paper.report.figures_curves import FEW
 from legged_torque.paper.report.style import in_words, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import portable_path, without_machine, write_whole
-from legged_torque.utils.words import counted
 
 MEDIA_TYPES = {".png": "image/png", ".gif": "image/gif", ".mp4": "video/mp4", ".webm": "video/webm"}
 VIDEOS = [".gif", ".mp4", ".webm"]

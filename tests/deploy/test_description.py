@@ -6,6 +6,7 @@ import hashlib
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from support.exports import change
@@ -36,18 +37,49 @@ def test_damaged_descriptions(exported, description, tmp_path, path, value, mess
     assert message in error_of(Policy, folder)
 
 
-def test_network_without_meaning(exported, description, tmp_path):
-    """A network that does not say what its inputs and outputs mean is refused, even with its own checksum."""
+def test_one_file_is_enough(exported, description, tmp_path):
+    """A network holds all of policy.yaml, under any name: the same actions, and sim2sim.py runs."""
+    file = shutil.copy(exported / "policy.onnx", tmp_path / "walk.onnx")
+    alone, both = Policy(file), Policy(exported)
+    assert alone.description == both.description == description
+    obs = np.random.default_rng(0).normal(size=57)
+    assert alone.act(obs).tobytes() == both.act(obs).tobytes()
+    assert run_here("sim2sim.py", str(file), "--steps=2", "--robots=1", root=tmp_path)[0] == 0
+
+
+@pytest.mark.parametrize("kept", [(), ("joint_order", "nominal_pose", "observations", "actions")])
+def test_networks_that_do_not_describe_themselves(exported, description, tmp_path, kept):
+    """Those of older exports need policy.yaml; without any meaning of inputs and outputs, a network is refused."""
     onnx = pytest.importorskip("onnx")
     folder = shutil.copytree(exported, tmp_path / "out")
     network = onnx.load(folder / "policy.onnx")
-    assert {entry.key for entry in network.metadata_props} == {"joint_order", "nominal_pose", "observations", "actions"}
-    del network.metadata_props[:]
+    meaning = {entry.key: entry.value for entry in network.metadata_props}
+    assert meaning.keys() == description.keys()
+    onnx.helper.set_model_props(network, {key: meaning[key] for key in kept})
     onnx.save(network, folder / "policy.onnx")
     description = copy.deepcopy(description)
     description["network"]["sha256"] = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
+    description["gains"]["stiffness"]["FR_hip_joint"] = 25.0
     (folder / "policy.yaml").write_text(yaml.safe_dump(description))
-    assert "was exported with other joint_order than those of its policy.yaml" in error_of(Policy, folder)
+    if kept:
+        assert Policy(folder).stiffness[0] == 25.0
+    else:
+        assert "another policy.yaml, which was changed in: " in error_of(Policy, folder)
+    (folder / "policy.yaml").unlink()
+    assert "policy.onnx' does not describe itself" in error_of(Policy, folder)
+
+
+@pytest.mark.parametrize(
+    ("key", "text", "message"),
+    [("network", "3", "not describe itself"), ("gains", "{", "gains in"), ("timing", "{}", "'control_frequency'")],
+)
+def test_damaged_metadata(exported, tmp_path, key, text, message):
+    """What a network says of itself is checked as policy.yaml is."""
+    onnx = pytest.importorskip("onnx")
+    network = onnx.load(exported / "policy.onnx")
+    next(entry for entry in network.metadata_props if entry.key == key).value = text
+    onnx.save(network, tmp_path / "walk.onnx")
+    assert message in error_of(Policy, tmp_path / "walk.onnx")
 
 
 @pytest.mark.parametrize(
@@ -55,7 +87,6 @@ def test_network_without_meaning(exported, description, tmp_path):
     [
         ("policy.onnx", b"network", "policy.onnx' is not a readable network"),
         ("policy.onnx", None, "there is no network"),
-        ("policy.yaml", None, "there is no policy.yaml in"),
         ("policy.yaml", b"\xff\xfe", "is not valid YAML"),
         ("policy.yaml", b"3", "is not of type 'object'"),
     ],

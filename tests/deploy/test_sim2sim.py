@@ -125,10 +125,7 @@ def test_recorder(policy):
 
 @pytest.mark.parametrize("factor", [None, 1.5])
 def test_pushes(policy, monkeypatch, factor):
-    """Half of the pushes add a draw to the trunk's velocity, the others set it to the training's factor times a draw.
-
-    Exports of older versions name no factor: 1.0 is taken, and a note says so.
-    """
+    """Half of the pushes add a draw to the trunk's velocity, the others set it to factor x draw (old exports: 1)."""
     pushes = {"pushes": {"set_factor": factor}} if factor else {}
     others = {key: value for key, value in policy.description.items() if key != "pushes"}
     monkeypatch.setattr(policy, "description", others | pushes)
@@ -191,10 +188,7 @@ def test_episodes_end(policy):
 
 
 def test_script(exported, tmp_path, monkeypatch):
-    """It prints the metrics with standard errors and writes them; any of the three paths names the policy.
-
-    Mistakes are one line.
-    """
+    """It prints the metrics and writes them; any of the three paths names the policy; mistakes are one line."""
     words = ["--steps=20", "--robots=2", "--push_velocity=0.5", "--command", "0.5", "0", "-0.2"]
     outputs = []
     for path in (exported, exported / "policy.yaml", exported / "policy.onnx"):

@@ -2,21 +2,12 @@
 
 import numpy as np
 import pytest
-from support.robot_files import (
-    EVEN_TRUNK,
-    changed,
-    joint,
-    servo,
-    setting,
-    shuffle_motors,
-    turn_left_hips,
-    unitree_order,
-)
+from support.robot_files import EVEN_TRUNK, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
+from support.robot_files import changed as changed  # a fixture
 from support.settings import error_of
 
 from legged_torque.deploy.robot import MujocoRobot
 
-__all__ = ["changed"]
 STATE = np.array([0.0, 0.0, 0.31]), np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -34,10 +25,7 @@ def walk(robot, policy, steps=10):
 
 
 def test_mirrored_axes_are_turned_around(policy, changed):
-    """A file whose left hips turn the other way, as in the authors' A1, moves as ours does, and a line says so.
-
-    Its joints and motors are in Unitree's orders, which needs no line.
-    """
+    """A file whose left hips turn the other way moves as ours does, and a line says so; orders need no line."""
     expected = walk(MujocoRobot(changed(EVEN_TRUNK), policy.description), policy)
     weak = [setting(f".//joint[@name='{leg}_hip_joint']", range="-0.7 0.8") for leg in ("FL", "RL")]
     changes = (EVEN_TRUNK, turn_left_hips, unitree_order, shuffle_motors, *weak)

@@ -68,10 +68,7 @@ def test_small_commands_become_zero(make_task):
 
 @pytest.mark.parametrize(("tracking", "shares"), [(0.85, [0.3, 0.4, 0.5]), (0.75, [0.3, 0.3, 0.3])])
 def test_ranges_grow(make_task, monkeypatch, tracking, shares):
-    """After each length of an episode with more than 0.8 of the tracking reward, ranges grow by 0.1 of their widths.
-
-    Other worlds go on from there, and evaluations take all of the ranges.
-    """
+    """Each episode's length tracked above 0.8 widens ranges by 0.1, also in other worlds; evaluations take all."""
     ranges = {"lin_vel_x": [-1.0, 2.0], "lin_vel_y": [0.5, 0.8], "ang_vel_yaw": [-3.0, -1.0]}
     changes = {f"commands.ranges.{name}": value for name, value in ranges.items()}
     changes |= {"commands.curriculum": True, "commands.curriculum_start": 0.3, "env.episode_length_s": 0.1}

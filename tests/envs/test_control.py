@@ -152,10 +152,7 @@ def test_torques_are_clipped(make_task, name):
 
 @pytest.mark.parametrize(("name", "refresh"), [("a1_position", True), ("a1_position", False), ("a1_multihead", True)])
 def test_step_is_four_physics_steps(make_task, name, refresh):
-    """One step moves each world as plain MuJoCo under PD torques that are computed anew before each physics step.
-
-    With refresh_torques off they are computed once and held.
-    """
+    """A step is plain MuJoCo's under PD torques of each physics step, or without refresh_torques of the first one."""
     task = make_task(name, 2, **IN_THE_AIR, **CONVERGED, **{"control.refresh_torques": refresh})
     random_state(task)
     action = np.random.default_rng(1).normal(size=(2, task.num_actions))

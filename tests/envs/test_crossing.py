@@ -9,8 +9,8 @@ from support.settings import error_of
 
 from legged_torque.envs.base.crossing import Grounds, cross
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.terrain import make_terrain
 from legged_torque.terrain.layout import Layout
+from legged_torque.terrain.rough import make_terrain
 from legged_torque.terrain.tiles import TILES
 from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import task_registry

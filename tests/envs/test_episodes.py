@@ -100,10 +100,7 @@ LEANING |= {"init_dof_pos_scale": [1.0, 1.1]}
 
 @pytest.mark.parametrize("ranges", [UPRIGHT, LEANING])
 def test_initial_states(make_task, ranges):
-    """Initial angles fill their ranges, by default those of the design; the trunk is at rest at its place.
-
-    Joints are at q_nominal times a number of their own, kept inside their limits.
-    """
+    """Angles fill their ranges; joints are q_nominal times a number each, inside limits; the trunk is at rest."""
     changes = {} if ranges is UPRIGHT else {f"domain_rand.{key}": value for key, value in ranges.items()}
     task = make_task("a1_torque", 512, **changes)
     np.testing.assert_allclose(task.base_pos, np.tile([0.0, 0.0, 0.4], (512, 1)), atol=1e-6)

@@ -2,32 +2,19 @@
 
 import operator
 import re
+from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from support.control import IN_THE_AIR
 from support.settings import error_of, get_cfgs
 
 from legged_torque.envs import A1Cfg, A1CfgPPO, A1TorqueCfg, LeggedRobot, TorqueRobot
-from legged_torque.utils.config import section_keys
+from legged_torque.utils.config import section_keys, successors
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.successors import successors
 
-IDLE = {
-    "_resample_commands": "generator",
-    "_push_robots": "push_probability",
-    "update_command_curriculum": "commands.curriculum",
-    "_update_terrain_curriculum": "terrain.curriculum",
-    "_reset_dofs": "init_dof_pos_scale",
-    "_get_noise_scale_vec": "noise_scales",
-    "_process_rigid_body_props": "trunk_mass",
-    "compute_observations": "observation_terms",
-    "_compute_torque": "'_compute_torques'",
-    "check_terminations": "'check_termination'",
-    "_reward_tracking_lin_vels": "'_reward_tracking_lin_vel'",
-    "_reward_silence": "rewards.scales.silence",
-    "_termination_silence": "terminations.silence",
-}
+IDLE = yaml.safe_load(Path(__file__).with_name("hooks.yaml").read_text("utf-8"))["idle"]
 
 
 def small(**settings):

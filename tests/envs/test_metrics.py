@@ -183,11 +183,7 @@ FRICTION = {"motors.chain": ["delay", "ideal", "friction"], "motors.friction.vis
     ],
 )
 def test_power_of_all_physics_steps(make_task, name, torques, motors, viscous):
-    """Work and heat are those of a plain MuJoCo loop over the physics steps, in the kernel and with torques in torch.
-
-    Motors pay for their own friction, which joints do not get.
-    Measured worlds go on as others do to the bit, which take one launch per control step.
-    """
+    """Work and heat are those of a plain MuJoCo loop, kernel or torch, and measuring changes no bit of the motion."""
     settings = {**CONVERGED, "control.copper_loss": COPPER, "env.episode_length_s": 1e3, **motors}
     plain, *measured = (make_task(name, 2, **settings) for _ in range(3))
     torques_in_torch(measured[1])

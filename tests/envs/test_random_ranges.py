@@ -94,14 +94,7 @@ def test_units_of_the_robot(make_task):
     assert (kept.field("dof_frictionloss").numpy() != model.dof_frictionloss).any()
 
 
-@pytest.mark.parametrize(
-    ("name", "limits", "note"),
-    [
-        ("trunk_mass", {"add": [-1.0, 2.4]}, "trunk_mass changes a mass of 4.713 kg by 2.4 kg"),
-        ("dof_frictionloss", {"set": [0.0, 3.5]}, "dof_frictionloss draws up to 3.5 N m, but a motor has 33.5 N m"),
-        ("dof_armature", {"set": [0.1, 0.2]}, "dof_armature draws 0.1 to 0.2, but the robot's own value is 0.01"),
-    ],
-)
+@pytest.mark.parametrize(("name", "limits", "note"), PUBLISHED["foreign"])
 def test_ranges_of_another_robot(make_task, name, limits, note):
     """A line says which ranges do not fit the robot; those of the A1 fit, also the hard ones."""
     (message,) = make_task("a1_position", 1, **ON, **{f"domain_rand.{name}": limits}).notes
@@ -111,13 +104,7 @@ def test_ranges_of_another_robot(make_task, name, limits, note):
     assert make_task("a1_position", 1, **ON, **ranges).notes == []
 
 
-@pytest.mark.parametrize(
-    ("name", "limits", "message"),
-    [
-        ("trunk_mass", {"add": [-5.0, 1.0]}, "'trunk_mass' can be -0.287 with the ranges given"),
-        ("stiffness", {"add": [-21.0, 0.0]}, "'stiffness' can be -1"),
-    ],
-)
+@pytest.mark.parametrize(("name", "limits", "message"), PUBLISHED["negative"])
 def test_sums_that_make_no_sense(make_task, name, limits, message):
     """A range that can make a parameter negative is refused if it is drawn."""
     make_task("a1_torque", 1, **{f"domain_rand.{name}": limits})

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import yaml
 from support.robot_files import A1, EVEN_TRUNK, joint, servo, setting, shuffle_motors, turn_left_hips, unitree_order
 from support.robot_files import changed as changed  # a fixture
 from support.scripts import run_here
@@ -57,23 +58,28 @@ def test_the_same_robot_in_another_order(changed, make_task):
     assert (ours.torques.abs() > 1.0).any() and ours.contacts.any()
 
 
-LIMITS = {
-    "ctrlrange alone": [setting(".//default/motor", forcerange=None)],
-    "forcerange alone": [setting(".//default/motor", ctrlrange=None)],
-    "gear": [setting(".//default/motor", gear="-2", ctrlrange="-5 6", forcerange="-4 9")],
-    "joint": [joint("FL_calf_joint", actuatorfrcrange="-7 3")],
-    "all": [
-        setting(".//default/motor", gear="0.5", ctrlrange="-30 40"),
-        joint("FL_calf_joint", actuatorfrcrange="-7 9"),
-        shuffle_motors,
-    ],
-}
+def described(change):
+    """The change of a file's tree that an entry of :data:`CHANGES` describes."""
+
+    def apply(root):
+        for path, attributes in change.get("set", {}).items():
+            setting(path, **attributes)(root)
+        for parent in list(root.iter()) if "remove" in change else ():
+            gone = root.find(change["remove"])
+            parent.remove(gone) if gone is not None and gone in list(parent) else None
+        for path, text in change.get("add", {}).items():
+            root.find(path).insert(99 if "last" in change else 0, ElementTree.fromstring(text))
+
+    return apply
 
 
-@pytest.mark.parametrize("changes", LIMITS.values(), ids=LIMITS)
-def test_torque_limits_are_the_tightest(changed, changes):
+CHANGES = yaml.safe_load(Path(__file__).with_name("robot_files.yaml").read_text("utf-8"))
+
+
+@pytest.mark.parametrize("name", CHANGES["limits"])
+def test_torque_limits_are_the_tightest(changed, name):
     """They are where plain MuJoCo clips torques, however the file says so; smaller torques reach their joints."""
-    file = changed(*changes)
+    file = changed(described(CHANGES["limits"][name]), *[shuffle_motors] * (name == "all"))
     model = load_asset(cfg_of(file)).mj_model
     extremes = [torques_of(file, ctrl) for ctrl in (-1e6, 1e6)]
     for i, name in enumerate(POSE):
@@ -96,68 +102,12 @@ def test_servos_are_refused(changed, make_task, engine):
     assert "reads it as a motor (FL_hip, FL_thigh)" in error_of(make_engine, engine, model, 1)
 
 
-def remove(path):
-    """A change that takes an element away."""
-    return lambda root: [parent.remove(root.find(path)) for parent in root.iter() if root.find(path) in list(parent)]
-
-
-def second_motor(root):
-    """Another motor of a joint that has one."""
-    ElementTree.SubElement(root.find("actuator"), "motor", name="x", joint="FR_hip_joint", ctrlrange="-1 1")
-
-
-def second_tree(root):
-    """A hinge that hangs on the world."""
-    body = ElementTree.SubElement(root.find("worldbody"), "body")
-    ElementTree.SubElement(body, "joint", name="door")
-    ElementTree.SubElement(body, "geom", name="door", size="0.1")
-
-
-def post_before(root):
-    """A body that does not become a part of the world, before the trunk."""
-    root.find("worldbody").insert(0, ElementTree.Element("body", name="post", mocap="true"))
-
-
-REFUSED = {
-    "trunk after others": ([post_before], "the trunk 'trunk' must be the first body, before 'post'"),
-    "no motor": ([remove("actuator/motor[4]")], "each joint must have one motor, not 0 (FL_hip_joint)"),
-    "two motors": ([second_motor], "each joint must have one motor, not 2 (FR_hip_joint)"),
-    "no limits": (
-        [setting(".//default/motor", forcerange=None, ctrlrange=None)],
-        "motors need torque limits, for example a forcerange (FR_hip_joint, FR_thigh_joint",
-    ),
-    "unnamed geom": (
-        [setting(".//geom[@name='RL_calf']", name=None)],
-        "need names, by which settings refer to them; those of 'RL_calf'",
-    ),
-    "no floor": ([setting(".//geom[@name='floor']", name="ground")], "it must have a geom 'floor' in its worldbody"),
-    "no free joint": ([remove(".//freejoint")], "must have one body with a free joint, the trunk, not 0"),
-    "unnamed joint": (
-        [setting(".//joint[@name='RL_calf_joint']", name=None), remove("actuator/motor[12]")],
-        "a joint of the body 'RL_calf' has no name",
-    ),
-    "not on the trunk": ([second_tree], "the joint 'door' does not hang on the trunk 'trunk'"),
-    "nominal pose": (
-        [joint("FL_calf_joint", range="-2.6 -1.6")],
-        "init_state.default_joint_angles has -1.5 for 'FL_calf_joint', whose range is -2.6 to -1.6",
-    ),
-    "feet through the floor": (
-        [setting(".//default[@class='foot_collision']/geom", contype="2", conaffinity="2")],
-        "contype and conaffinity let FR_foot, FL_foot, RR_foot, RL_foot through the geom 'floor'",
-    ),
-    "missing geoms": (
-        [setting(".//geom[@name='trunk']", name="base")],
-        "unknown collision geom (part of its name) 'trunk'",
-    ),
-}
-
-
-@pytest.mark.parametrize(("changes", "reason"), REFUSED.values(), ids=REFUSED)
-def test_refused(changed, changes, reason):
+@pytest.mark.parametrize("change", CHANGES["refused"].values(), ids=CHANGES["refused"])
+def test_refused(changed, change):
     """A file that a task cannot simulate is refused in a line that names the file and the part."""
-    file = changed(*changes)
+    file = changed(described(change))
     message = error_of(load_asset, cfg_of(file))
-    assert message.startswith(f"'{file}' cannot be simulated: ") and reason in message
+    assert message.startswith(f"'{file}' cannot be simulated: ") and change["told"] in message
 
 
 def test_all_problems_at_once(changed):

@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 from support.settings import error_of, torques_in_torch
+from support.simulator import LEGS, SENSED
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry
@@ -186,15 +187,10 @@ def test_gravity_pretraining_refuses_feet_of_several_geoms():
     assert "'resources/robots/g1/g1.xml' has 8 for 2 feet" in error_of(make_controller, task)
 
 
-A1_XML = str(resource_path("resources/robots/a1/a1.xml"))
-LEGS = ("FR", "FL", "RR", "RL")
-COLLISION_GEOMS = {"trunk"} | {f"{leg}_{part}" for leg in LEGS for part in ("hip", "thigh", "calf", "foot")}
-
-
 @pytest.fixture(scope="module")
 def model():
     """The compiled model."""
-    return mujoco.MjModel.from_xml_path(A1_XML)
+    return mujoco.MjModel.from_xml_path(str(file_of("a1")))
 
 
 def named_geoms(model):
@@ -205,8 +201,7 @@ def named_geoms(model):
 
 def test_joint_dynamics(model):
     """Joints have armature 0.01 and friction loss 0.2, no damping, no spring; the free root has none of them."""
-    expected = {"dof_armature": 0.01, "dof_frictionloss": 0.2, "dof_damping": 0.0}
-    for field, value in expected.items():
+    for field, value in {"dof_armature": 0.01, "dof_frictionloss": 0.2, "dof_damping": 0.0}.items():
         per_dof = getattr(model, field).reshape(model.nv, -1)
         np.testing.assert_allclose(per_dof[:6], 0.0, err_msg=field)
         np.testing.assert_allclose(per_dof[6:, 0], value, err_msg=field)
@@ -217,7 +212,7 @@ def test_joint_dynamics(model):
 def test_collision_geoms(model):
     """There are exactly the named collision geoms, hidden by default, with the published contact parameters."""
     geoms = named_geoms(model)
-    assert set(geoms) == COLLISION_GEOMS
+    assert set(geoms) == set(SENSED)
     for name, i in [*geoms.items(), ("floor", model.geom("floor").id)]:
         assert model.geom_condim[i] == 3
         assert model.geom_friction[i, 0] == 1.0

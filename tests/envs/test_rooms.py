@@ -10,8 +10,8 @@ from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors.config import by_joint
 from legged_torque.sim.randomization import RandomParameter
-from legged_torque.terrain import TERRAINS
-from legged_torque.terrain.terrain import Plane
+from legged_torque.terrain.rough import TERRAINS
+from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.mirroring import SCALAR
 
 LEGS = ("FR", "FL", "RR", "RL")
@@ -75,6 +75,10 @@ def test_observation_terms_that_do_not_fit(term, message):
         ),
         (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
         (lambda task: RandomParameter("thigh_mass", "body_mass", [3, 6], {"scale": [0.5, 0.9]}), "'thigh_mass'"),
+        (
+            lambda task: RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]}),
+            "does not read 'dof_damping' of the trunk's free joint",
+        ),
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
@@ -89,7 +93,7 @@ def test_parameters_that_do_not_fit(make, message):
     assert message in error_of(lambda: Robot(cfg).mirror)
 
 
-class Raised(Plane):
+class Raised(Terrain):
     """Ground that is 0.1 m higher for the task than in the physics."""
 
     def height_above(self, points):

@@ -30,10 +30,7 @@ def mirror_critic(obs):
 
 
 def mirror_drawn(drawn):
-    """Mass, centre of mass, radius, feet; four per joint; three of the ground; then those of the controller.
-
-    These are strength and offset per joint, the action scale, and two gains per joint.
-    """
+    """Trunk, feet, four per joint, ground; then strength and offset per joint, action scale, two gains per joint."""
     trunk, feet, joints, ground, *control = drawn.split([5, 12, 48, 3, 12, 12, 1, 12, 12], dim=1)
     strength, offsets, action_scale, *gains = control
     strength, *gains = (values.reshape(-1, 4, 3)[:, [1, 0, 3, 2]].flatten(1) for values in (strength, *gains))

@@ -38,11 +38,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 
 @pytest.fixture(scope="module")
 def killed(tmp_path_factory):
-    """A smoke experiment of one cell that was killed in the middle of its training.
-
-    Returns:
-        Its file, its folder and what it has printed.
-    """
+    """A smoke experiment that was killed in the middle of its training: its file, its folder, its output."""
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
     values["train"] |= {"runner.total_steps": 40 * 32, "runner.save_interval": 2}
     values |= {"tasks": ["a1_torque_multihead"], "environments": {"low": ["high"]}}
@@ -127,10 +123,7 @@ def test_dry_run(name, cells, tmp_path):
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    TABLES["file"],
-)
+@pytest.mark.parametrize(("change", "message"), TABLES["file"])
 def test_mistakes_in_the_file(change, message, tmp_path):
     """A key, name or value that makes no sense is refused in one line with exit status 2, and nothing is written."""
     file = write(tmp_path / "matrix.yaml", SMALL | change)
@@ -139,10 +132,7 @@ def test_mistakes_in_the_file(change, message, tmp_path):
     assert list(tmp_path.iterdir()) == [file]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    TABLES["command line"],
-)
+@pytest.mark.parametrize(("words", "message"), TABLES["command line"])
 def test_mistakes_in_the_command_line(words, message, tmp_path):
     """They are refused in one line, too."""
     texts = {"file": yaml.safe_dump(SMALL), "broken": "tasks: ["}

@@ -49,10 +49,7 @@ def test_order_and_commands(stage, tmp_path):
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
-    """It is tried once more; the exit status is 1, the last lines of its log are shown.
-
-    The next call tries it again, and only it.
-    """
+    """It is tried once more; status 1, the end of its log is shown; the next call tries it, and only it, again."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("fail a1_position-low-s1")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)

@@ -17,7 +17,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_node import write_files
+from legged_torque.experiments.ray_launcher import write_files
 
 FAST = {
     "health_check_initial_delay_ms": 0,

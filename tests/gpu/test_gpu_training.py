@@ -51,7 +51,7 @@ def test_flashsac(device, tmp_path):
     words = ["--task=a1_position", "--preset=flashsac", "--num_envs=64", f"--device={device}", *UNSEEN]
     words += ["--set=flashsac.buffer_min_length=512", "--set=flashsac.replay_buffer_size=4096"]
     words += ["--set=flashsac.learning_rate_end=3e-4", "--set=flashsac.save_replay=true"]
-    words += ["--set=flashsac.mini_batch_size=64", "--set=flashsac.updates_per_step=1"]
+    words += ["--set=flashsac.updates_per_step=1"]
     graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
     for name, capture in graphs.items():
         iterations = f"--max_iterations={3 if name == 'stopped' else 6}"

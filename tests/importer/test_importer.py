@@ -77,6 +77,8 @@ def test_urdf(written):
     assert cfg.asset.max_dof_vel == 15.0
     torque = model.body_mass.sum() * cfg.rewards.base_height_target / (12.453 * 0.303)  # as many times that of an A1
     assert cfg.rewards.scales.torques * torque**2 == pytest.approx(-2e-4, rel=0.03)
+    largest = robot.stance.load * 0.28 / cfg.rewards.base_height_target  # less for larger robots, which learn with less
+    assert cfg.control.torque_scale == pytest.approx(1.1 * largest, rel=0.03)
     assert cfg.asset.mirrored_legs == [["RF", "LF"], ["RH", "LH"]]
     foot = model.geom("RH_foot")
     assert foot.size[0] == 0.025

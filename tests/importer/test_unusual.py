@@ -5,11 +5,11 @@ import re
 import mujoco
 import numpy as np
 import pytest
+from support.motion import check_motion
 from support.urdf import urdf_of
 
-from legged_torque.importer.check import check
 from legged_torque.importer.mjcf import mjcf
-from legged_torque.importer.robot import import_robot
+from legged_torque.importer.robot import check, import_robot
 
 
 @pytest.fixture
@@ -25,41 +25,6 @@ def imported(tmp_path):
         return robot, model, data, check(robot, data)
 
     return run
-
-
-def free_accelerations(model, joints, angles):
-    """Return how torques accelerate the joints of a robot that floats freely: the same in every frame of its trunk."""
-    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
-    for joint, angle in zip(joints, angles, strict=True):
-        data.joint(joint).qpos = angle
-    mujoco.mj_forward(model, data)
-    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
-    dofs = [model.joint(joint).dofadr[0] for joint in joints]
-    matrix[dofs, dofs] -= model.dof_armature[dofs]  # which the importer may assume
-    return np.linalg.inv(matrix)[np.ix_(dofs, dofs)]
-
-
-def check_motion(text, robot, model):
-    """The imported model moves as MuJoCo's own reading of the source says."""
-    spec = mujoco.MjSpec.from_string(text)
-    for geom in spec.geoms:
-        geom.mass = 0.0 if "<robot" in text else geom.mass
-    (root,) = [body for body in spec.worldbody.bodies if len(body.find_all("joint")) > 1]
-    if not root.joints:
-        root.add_freejoint()
-    spec.compiler.fusestatic = True
-    source = spec.compile()
-    source.dof_armature[:6] = 0.0  # of the free joint, which is left out
-    names = [source.joint(i).name for i in range(1, source.njnt)]
-    random = np.random.default_rng(0)
-    assert model.body_mass.sum() == pytest.approx(source.body_mass.sum(), rel=1e-4)
-    for _ in range(3):
-        angles = random.uniform(-1, 1, len(names))
-        expected, found = (
-            free_accelerations(each, joints, angles) for each, joints in ((source, names), (model, robot.joints))
-        )
-        np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
 
 def feet_share(model, data):
@@ -214,8 +179,20 @@ def test_turned_root(imported):
 def test_impossible_inertia(imported):
     """A + B >= C is reached by raising the two smaller moments alone, no more than it needs, and told by how much."""
     robot, model, *_ = imported(UNUSUAL["impossible calf"])
-    assert model.body("FL_link3").inertia.tolist() == pytest.approx([0.0031, 0.00303, 7e-5], rel=1e-4)
+    assert model.body("FL_link3").inertia.tolist() == pytest.approx([0.0031, 0.00303, 7e-5], rel=3e-4)
     assert any("'FL_link3' broke A + B >= C by 6e-05 kg m^2, 1.9%" in note for note in robot.source.notes)
+
+
+def test_flat_inertias(imported):
+    """A + B = C, which rounding breaks, stays as near to that as the digits of the MJCF allow."""
+    links, joints = legged(FOUR, three, SPHERE)
+    random = np.random.default_rng(0)
+    flat = {name: random.uniform(1e-4, 9e-4, 2) for name in links if name != "base"}
+    for name, (a, b) in flat.items():
+        links[name][0][3] = [a, 0, 0, b, 0, a + b]
+    _, model, *_ = imported(urdf_of(links, joints))
+    for name, (a, b) in flat.items():
+        np.testing.assert_allclose(sorted(model.body(name).inertia), sorted([a, b, a + b]), rtol=1e-4)
 
 
 def test_box_feet(imported):

@@ -271,10 +271,7 @@ def test_bad_numbers_in_one_process_are_skipped_by_both(together):
 
 
 def test_two_machines_without_shared_files(together, tmp_path):
-    """A process on each goes on from the run that the first has; they learn what two on one machine do, bit by bit.
-
-    There is one folder and one set of prints, and Ctrl-C saves the iteration that both have finished.
-    """
+    """Both go on from the first one's run, with the bits of two processes on one machine, one folder, one output."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -153,10 +153,7 @@ def test_random_numbers_of_its_own(make_runner, noted):
 
 @pytest.mark.parametrize(("chosen", "expected"), [("", "low"), ("doubled", "doubled")])
 def test_environments(make_runner, noted, chosen, expected):
-    """Worlds are perturbed as those of the training unless ``evaluation.perturbation`` says otherwise.
-
-    Further environments are measured from their step on, in worlds of their own, and logged apart.
-    """
+    """Worlds are perturbed as the training's or as chosen; further environments are measured and logged apart."""
     also = {"evaluation.also": ["high", "none"], "evaluation.also_from": 30, "evaluation.interval": 16}
     also |= {"evaluation.perturbation": chosen, "runner.logger": "tensorboard"}
     runner = make_runner(perturbation="low", **also)

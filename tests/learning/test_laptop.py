@@ -25,11 +25,7 @@ SMALL += ["--device=cpu", "--logger=none", "--set=evaluation.interval=0", "--tas
 
 
 def train_and_end(folder, number, *words):
-    """Start train.py on two cores, send its process a signal after an iteration, and wait until all have ended.
-
-    Returns:
-        Exit status of the first process, what all have printed, and how many others there were.
-    """
+    """Send train.py on two cores a signal after an iteration; return status, output, number of others."""
     command = [*COMMAND, ROOT / "scripts" / "train.py", *SMALL, f"--log_root={folder}", *words]
     environment = os.environ | PATHS | {"OMP_NUM_THREADS": "2"}
     output, others = "", []

@@ -1,4 +1,4 @@
-"""Trainings repeat to the bit on a CPU, and survive kills at any moment."""
+"""Trainings repeat to the bit on a CPU, and survive kills."""
 
 import random
 import time
@@ -23,18 +23,17 @@ def train(folder, *words):
 
 
 def test_killed(tmp_path):
-    """All files are whole after kills, and the training goes on from the last checkpoint to the same end."""
-    logs, straight, chance = tmp_path / "logs", tmp_path / "straight", random.Random(2)
-    for kills in range(2):
-        process = start(logs, *SMALL, "--max_iterations=1000000", *(["--resume"] if kills else []))
-        while len(list(logs.glob("*/*/model_*.pt"))) < 2 + kills:
-            assert process.poll() is None
-            time.sleep(0.01)
-        time.sleep(chance.uniform(0.0, 0.3))
-        process.kill()
-        process.communicate()
-        assert all(map(is_whole_archive, logs.glob("*/*/*_*.pt")))
-        assert all((run / CONFIG_FILE).is_file() for run in logs.glob("*/*/"))
+    """All files are whole after a kill, and the training goes on from the last checkpoint to the same end."""
+    logs, straight = tmp_path / "logs", tmp_path / "straight"
+    process = start(logs, *SMALL, "--max_iterations=1000000")
+    while len(list(logs.glob("*/*/model_*.pt"))) < 3:
+        assert process.poll() is None
+        time.sleep(0.01)
+    time.sleep(random.Random(2).uniform(0.0, 0.3))
+    process.kill()
+    process.communicate()
+    assert all(map(is_whole_archive, logs.glob("*/*/*_*.pt")))
+    assert all((run / CONFIG_FILE).is_file() for run in logs.glob("*/*/"))
     last = max(int(file.stem[6:]) for file in logs.glob("*/*/model_*.pt"))
     resumed = train(logs, "--resume", f"--max_iterations={last + 1}")
     straight.mkdir()

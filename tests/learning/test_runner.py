@@ -77,10 +77,7 @@ def test_two_iterations_of_every_task(make_runner, tmp_path, name, capsys):
 
 
 def test_logs_and_checkpoints_are_of_their_iterations(make_runner, tmp_path):
-    """Curves have the numbers of each update at its iteration, though written later.
-
-    Checkpoints, of every interval and of the end, count all steps and the seconds of all the training so far.
-    """
+    """Curves have each update's numbers at its iteration; checkpoints count all steps and seconds so far."""
     runner = make_runner(log_root=tmp_path, **{"runner.save_interval": 2})
     update, updates = runner.alg.update, []
 

@@ -1,10 +1,13 @@
 """Motor models: each as its formula by hand in torch, in the kernel and in numpy; MuJoCo's DC motor; refusals."""
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 import torch
 import warp as wp
+import yaml
 from support.control import NOMINAL, pd_by_hand
 from support.episodes import HIGH_UP
 from support.settings import error_of, torques_in_torch
@@ -22,17 +25,8 @@ from legged_torque.utils.options import Options
 NAMES = ["hip", "thigh", "calf"]
 WORLDS, STEPS, DECIMATION, DT, PEAK = 40, 6, 2, 0.005, 30.0
 POSE = np.array([0.1, 0.8, -1.5])
-CONSTANTS = {
-    "curve": {"knee_speed": {"hip": 13.5, "thigh": 10.0, "calf": 8.0}, "no_load_speed": {"calf": 8.0, "h": 30.0}}
-    | {"driving_torque": 20.2, "braking_torque": 23.4, "sag": 0.5},
-    "drive": {"damping": {"hip": 0.5, "thigh": 1.0, "calf": 0.0}, "stiffness": 20.0},
-    "lag": {"time_constant": {"hip": 0.0, "thigh": 0.002, "calf": 0.02}},
-    "friction": {"static_friction": 2.4, "coulomb_friction": 1.6, "viscous_friction": 0.16}
-    | {"load_friction": 0.05, "activation_speed": 0.5},
-    "thermal": {"continuous_torque": {"hip": 5.0, "thigh": 12.0, "calf": 40.0}, "time_constant": 0.02},
-    "quantize": {"resolution": {"hip": 0.5, "thigh": 0.01, "calf": 3.0}},
-    "muscle": {"growth": {"hip": 0.3, "thigh": 1.0, "calf": 0.7}},
-}
+TABLES = yaml.safe_load(Path(__file__).with_name("motors.yaml").read_text("utf-8"))
+CONSTANTS = TABLES["constants"]
 
 
 def by_hand(model, wanted, pos, vel):
@@ -194,10 +188,7 @@ def test_as_mujoco_s_dc_motor():
     [("drive", {"damping": 0.05}, 0.0), ("friction", {"viscous_friction": 0.03, "static_friction": 0.2}, 0.1)],
 )
 def test_energy_balance(model, constants, made):
-    """What the drive's damping and friction take from a turning body is what it loses, step by step, as MuJoCo counts.
-
-    A motor with friction is counted as making what was asked of it.
-    """
+    """What damping and friction take from a turning body is what it loses; motors make what was asked of them."""
     body = mujoco.MjModel.from_xml_string(
         '<mujoco><option timestep="0.002" gravity="0 0 0"><flag energy="enable"/></option><worldbody><body>'
         '<joint name="joint"/><geom size="0.1" mass="3"/></body></worldbody>'
@@ -264,20 +255,7 @@ def test_draws_and_resets():
     assert (link.values.power[:100] == 0.0).all() and (link.values.power[100:, 0] > 0.0).any()
 
 
-@pytest.mark.parametrize(
-    ("task", "choice", "joint", "speed", "most"),
-    [
-        ("a1_torque", "real", "FL_hip_joint", 20.9, 33.5),
-        ("go1_torque", "real", "RR_calf_joint", 20.0, 35.55),
-        ("go1_torque", "real", "RR_calf_joint", 20.1, 0.0),
-        ("go2_torque", "real", "RR_calf_joint", 21.75, 20.2 / 2),
-        ("go2_torque", "unitree_train", "RR_calf_joint", -30.0, 23.4),
-        ("go2_torque", "urdf", "RR_calf_joint", 15.6, 45.43),
-        ("g1_position", "real", "left_knee_joint", 14.0, 111.0 - 2.4 - 0.24 * 14.0),
-        ("g1_position", "real", "right_hip_yaw_joint", -30.0, 83.3 + 1.6 + 0.16 * 30.0),
-        ("g1_position", "real", "left_ankle_roll_joint", 30.0, 2 * (24.8 - 0.6 - 0.06 * 30.0)),
-    ],
-)
+@pytest.mark.parametrize(("task", "choice", "joint", "speed", "most"), TABLES["choices"])
 def test_choices(task, choice, joint, speed, most):
     """The motors of a robot have the torques of their sources."""
     cfg = task_registry.get_cfgs(task, Options(device="cpu", motors=choice))[0]
@@ -302,19 +280,7 @@ def test_armature():
     assert cfg.motors.of_joints(list(cfg.init_state.default_joint_angles)) == {}
 
 
-@pytest.mark.parametrize(
-    ("model", "constants", "words"),
-    [
-        ("curve", {"knee_speed": 31.0, "no_load_speed": 30.0}, ["motors.own.knee_speed", "30", "31", "'hip'"]),
-        ("curve", {"braking_torque": -1.0}, ["motors.own.braking_torque", "at least 0", "-1"]),
-        ("curve", {"armature": {"hip": -1.0}}, ["motors.own.armature", "-1"]),
-        ("drive", {"damping": {"hip": 1.0}}, ["motors.own.damping", "thigh"]),
-        ("lag", {"time_constnt": 0.1}, ["time_constant"]),
-        ("friction", {"activation_speed": 0.0}, ["motors.own.activation_speed", "greater than 0"]),
-        ("encoder", {"velocity_resolution": {"h": 1.0, "calf": 0.0}}, ["motors.own.velocity_resolution", "greater"]),
-        ("thermal", {"draws": {"continous_torque": {"scale": [0.9, 1.1]}}}, ["did you mean 'continuous_torque'"]),
-    ],
-)
+@pytest.mark.parametrize(("model", "constants", "words"), TABLES["refused"])
 def test_refused(model, constants, words):
     """Constants that make no sense are refused by name, in settings and in ``policy.yaml``."""
     lines = [error_of(lambda: settings(model, **constants).build(joints()))]

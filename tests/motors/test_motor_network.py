@@ -2,10 +2,12 @@
 
 import itertools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from support.control import NOMINAL, pd_by_hand
 from support.episodes import HIGH_UP, time_out
 from support.settings import error_of
@@ -17,6 +19,7 @@ from legged_torque.utils.config import to_dict
 from legged_torque.utils.options import Options
 from legged_torque.utils.plain_yaml import parse_yaml
 
+NETWORKS = yaml.safe_load(Path(__file__).with_name("motors.yaml").read_text("utf-8"))["networks"]
 ACTIVATIONS = {
     "softsign": torch.nn.Softsign,
     "tanh": torch.nn.Tanh,
@@ -67,10 +70,7 @@ class Histories:
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_as_the_module(make_task, tmp_path, activation):
-    """In a position task, it sees the policy's targets, whatever gains a world has; episodes start without a past.
-
-    numpy has the same torques.
-    """
+    """It sees the policy's targets, whatever gains a world has, and no earlier episode; numpy has the same torques."""
     network = perceptron([6, 16, 8, 1], activation)
     options = {f"motors.network.{name}": value for name, value in SCALES.items()}
     options |= write(tmp_path / "net.json", network, activation)
@@ -139,24 +139,7 @@ def test_torque_task(make_task, tmp_path):
         torch.testing.assert_close(task.torques, torch.full((2, 12), 4.0), rtol=0, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("content", "settings", "words"),
-    [
-        ([4, 8, 1], {}, ["layer 1", "6 inputs", "not 4"]),
-        ([6, 8, 2], {}, ["one output", "not 2"]),
-        ([6, 1], {"history": [0, 1]}, ["layer 1", "4 inputs", "not 6"]),
-        ([6, 1], {"step": 0.002}, ["0.002 s", "0.005 s"]),
-        ([6, 3000, 1], {}, ["at most 20000 numbers"]),
-        ([6, 1], {"draws": {"position_scal": {"scale": [0.9, 1.1]}}}, ["did you mean 'position_scale'"]),
-        ('{"activation": "softsgn", "layers": []}', {}, ["softsign"]),
-        ('{"activation": "tanh", "layers": [[[1, 2, 3], [1, 2]]]}', {"history": [0]}, ["layer 1", "not 1"]),
-        ('{"activation": "tanh", "layers": [[[NaN, 2, 3]]]}', {"history": [0]}, ["layers[0][0][0]", "finite"]),
-        ('{"activation": "tanh", "layers": []}', {}, ["one output"]),
-        ('{"layers": []}', {}, ["net.json", "docs/howto/motor.md"]),
-        ("PK\x03\x04 code", {}, ["cannot read", "net.json"]),
-        (None, {}, ["motors.network.file"]),
-    ],
-)
+@pytest.mark.parametrize(("content", "settings", "words"), NETWORKS)
 def test_refused(make_task, tmp_path, content, settings, words):
     """Files that are no networks, and networks of other sizes or clocks, are refused in one line."""
     named = {"motors.network.file": str(tmp_path / "net.json") if content else ""}

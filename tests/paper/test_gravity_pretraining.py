@@ -100,10 +100,7 @@ def test_report(made):
 
 @pytest.mark.parametrize("actor", ["controller", "policy"])
 def test_pairs(task, controller, actor):
-    """Actions are the controller's torques over 8 N m in exactly the states of the observations, for both actors.
-
-    There are more configurations than worlds, and not a multiple of them.
-    """
+    """Actions are the controller's torques over 8 N m in exactly the states of the observations, for both actors."""
     act = act_by_controller(controller) if actor == "controller" else lambda task: torch.randn(16, 12)
     torch.manual_seed(1)
     pairs, (qpos, qvel, touching, _, given) = follow_noting(task, controller, act, 21, 5)

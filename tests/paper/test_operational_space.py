@@ -220,10 +220,7 @@ def above_optimum(gradient, forces, mask):
 
 
 def test_forces_are_allowed_and_optimal():
-    """Inside pyramids and limits, exactly zero where nothing touches, and no allowed forces cost less.
-
-    With the controller's precision and iterations, forces are worse than these by no more than 3 N.
-    """
+    """Forces are allowed, 0 where nothing touches, none costs less; in single precision they are 3 N worse at most."""
     problem = random_problems()
     mask = problem[3]
     forces, residual = ForceDistribution(LIMITS, ARM, REGULARIZATION, "cpu", torch.float64)(*problem, CONVERGED)

@@ -55,10 +55,7 @@ def same(network, other):
 
 
 def test_a_policy_is_found_or_made(made, trained):
-    """Training starts from the file if there is one and else makes it, with the same result whatever its own seed.
-
-    Random numbers of a training are the same whether it had to make its policy or found one.
-    """
+    """The file is used or made, with one result whatever the training's seed, whose random numbers stay."""
     root, file, _, _ = made
     other, (found, found_files), (made_here, made_files) = trained
     assert f"Starting from the pre-trained policy '{file.relative_to(root)}'." in found
@@ -91,10 +88,7 @@ def test_first_iterations_train_the_critic_alone(made, trained):
 
 
 def test_a_resumed_training_has_its_policy(trained, tmp_path):
-    """It continues with its own policy and the rest of the critic's iterations, and looks for no other policy.
-
-    So does a run whose settings name the function of pre-training by its former module.
-    """
+    """It goes on with its own policy and the rest of the critic's iterations, also under the function's former name."""
     _, (_, found), _ = trained
     config = found[0].parent / "config.yaml"
     former = "legged_torque.control.gravity_pretraining:pretrain"

@@ -63,10 +63,7 @@ def test_counted_evaluations():
 
 
 def test_finished_runs():
-    """A run is finished if less than an interval between evaluations is left; without settings it has 110 million.
-
-    Evaluations count in the last 18%, in whole millions of steps: from 90 of 110 million on, as in Table I.
-    """
+    """Finished is a run with less than an interval left; evaluations count in the last 18%, in whole millions."""
     run = Training(CELL, {"low": evaluations(99, 104)})
     assert run.total_steps == 110_000_000 and not run.is_finished(104e6) and not Training(CELL).is_finished(0)
     for changes, total, start in (({}, 108, 89), ({"processes": 2}, 216, 177), ({"max_iterations": 1}, 1, 1)):

@@ -14,10 +14,7 @@ CHECK = ["--device=cpu", "--num_envs=6", "--check_standing"]
 
 
 def test_standing(made, tmp_path):
-    """The controller stands nearly always, acting at 200 Hz or at 50 Hz; a policy of constant torques never does.
-
-    The mean torque of a policy that says 0.5 for every joint is 4 N m.
-    """
+    """The controller stands nearly always, at 200 Hz or at 50 Hz; a policy of constant torques (4 N m) never does."""
     root, file, *_ = made
     content = torch.load(file, weights_only=True)
     *_, weight, bias = (name for name in content["actor_state_dict"] if name.startswith("mlp."))

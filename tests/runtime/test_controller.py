@@ -3,53 +3,18 @@
 import numpy as np
 import pytest
 from support.control import JOINTS
-from support.exports import export_random
+from support.simulated import RATE, World
 
 from legged_torque import resource_path
-from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
-from legged_torque.runtime.controller import Controller, Mode, drive_command
-from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.runtime.sim_robot import Faults, SimRobot
 from legged_torque.utils.errors import UserError
 
-RATE = 500.0
 ALLOWED = round(0.02 * RATE)  # ticks until a fault must have ended in damping
 TRIALS = 5  # of each fault
-
-
-@pytest.fixture(scope="module")
-def policy(make_task, tmp_path_factory):
-    """A random policy with both kinds of actions, small enough to stand with."""
-    folder = tmp_path_factory.mktemp("runtime") / "out"
-    export_random(make_task, "a1_torque_multihead", folder)
-    return Policy(folder)
-
-
-class World:
-    """A robot, its controller, and the time."""
-
-    def __init__(self, policy, brakes=None):
-        order = list(reversed(policy.joint_order))  # a robot has an order of its own
-        self.robot = SimRobot(resource_path(policy.description["robot"]["file"]), order, RATE)
-        self.wire, self.ticks = InProcess(self.robot), 0
-        self.controller = Controller(policy, order, RATE, brakes)
-
-    def run(self, ticks, missed=False):
-        """Some ticks; the mode at the end."""
-        for _ in range(ticks):
-            self.ticks += 1
-            self.wire.send(self.controller.step(self.wire.receive(), self.ticks / RATE, missed))
-        return self.controller.mode
-
-    def stand(self):
-        """Stand up from lying."""
-        self.run(5)
-        assert self.controller.request(Mode.STAND) == ""
-        self.run(round(3.5 * RATE))
-        return self
 
 
 def test_motors_and_latency():
@@ -80,7 +45,9 @@ def test_drives_do_what_the_policy_wants(policy):
     for _ in range(20):
         actions, state = rng.normal(0.0, 2.0, 24).astype(np.float32), random_state(rng)
         expected = policy.wanted_torques(actions, state.joint_positions, state.joint_velocities)
-        np.testing.assert_allclose(torques_of(drive_command(policy, actions), state), expected, rtol=1e-4, atol=1e-4)
+        tau, q, kp, kd = policy.drive_targets(actions)
+        command = MotorCommand(tau, q, np.zeros(12), kp, kd)
+        np.testing.assert_allclose(torques_of(command, state), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_torques_stay_within_limits_and_change_slowly():

@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_t
 from legged_torque.runtime import unitree_go2 as go2
 from legged_torque.runtime.dds import Go2Robot, Go2Side
 from legged_torque.runtime.interface import MotorCommand
+from legged_torque.runtime.motion_switcher import Release, SportMode
 from legged_torque.utils.errors import UserError
 
 DOMAIN = 100 + os.getpid() % 100  # each worker of pytest has its own
@@ -61,12 +63,12 @@ class Robot:
         return looks(transport, 0.2)
 
     def meet(self, transport):
-        """Wait until both sides have found each other, with messages that have no number: it is 0."""
+        """Wait until both sides have found each other, with messages of number 0, and the sport mode is released."""
         for _ in range(200):
             self.tell([0])
             transport.publish(numbered(0))
             found, heard = looks(transport, 0.03), self.heard()
-            if heard[0] == 0 and any(look.newest for look in found):
+            if heard[0] == 0 and any(look.newest for look in found) and not found[-1].problems:
                 return
         pytest.fail("the two sides have not met")
 
@@ -172,6 +174,57 @@ def test_commands_are_numbered(robot, transport):
     time.sleep(0.2)
     robot.tell([])
     assert robot.heard() == [5, 0, 0, 0, 0]
+
+
+def test_the_sport_mode_is_released_first(transport, monkeypatch):
+    """Before, a robot refuses commands, and none is sent; a robot that starts anew is asked anew."""
+    for _ in range(2):
+        with started() as robot:
+            heard = [np.nan, 0, 0, 0, 0]
+            for _ in range(200):  # until they have found each other
+                if not heard[4]:
+                    transport.publish(numbered(7))
+                    robot.tell([0])
+                    heard = robot.heard()
+            assert np.isnan(heard[0]) and heard[4]
+            with monkeypatch.context() as patch:
+                patch.setattr(transport, "publish", lambda message: pytest.fail("a command is sent"))
+                assert any("does not answer" in look.problems[0] for look in looks(transport, 0.05) if look.newest)
+                transport.send(torques(1.0))
+            robot.meet(transport)
+            transport.send(torques(2.0))
+            time.sleep(0.2)
+            robot.tell([])
+            assert robot.heard()[0] == 2.0
+
+
+def test_answers_of_the_motion_switcher():
+    """A mode is released; stale answers, errors and those that cannot be read release nothing. Requests are CDR."""
+    sent, service = [], SportMode()
+    release = Release(sent.append, is_optional=False)
+    for now, answered, problem, count in (
+        (0.0, [], "the motion switcher does not answer", 1),
+        (0.1, [0], "the sport mode 'normal' holds the motors", 2),
+        (0.2, [1, 0], "the sport mode 'normal' holds the motors", 2),
+        (0.35, [], "the sport mode 'normal' holds the motors", 3),
+        (0.4, [2], "", 3),
+    ):
+        release.look([service.answer(sent[i]) for i in answered], now)
+        assert (release.problem, len(sent)) == (problem, count)
+    for code, data, said in ((3104, "", "error 3104"), (0, "{", "'{'"), (0, '{"form": 0}', "form")):
+        release.begin()
+        release.look([], 1.0)
+        response = service.answer(sent[-1])
+        response.header.status.code, response.data = code, data
+        release.look([response], 1.1)
+        assert said in release.problem
+    for is_optional in (True, False):  # of a simulator without the service
+        release = Release(sent.append, is_optional)
+        for now in (5.0, 6.9, 7.1):
+            release.look([], now)
+            assert bool(release.problem) == (now < 7.0 or not is_optional)
+    number = sent[0].header.identity.id  # two of 64 bits, one for the lease, priority, a flag; text; an empty sequence
+    assert sent[0].serialize()[4:] == struct.pack("<qqqi?3xI3sxI", number, 1001, 0, 0, False, 3, b"{}", 0)
 
 
 def test_robots_that_start_anew_and_two_at_once(transport):

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 from support.exports import export_random
-from support.scripts import assert_told_in_one_line, run_here
+from support.scripts import ROOT, assert_told_in_one_line, run_here
 
 pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
 
@@ -100,6 +100,26 @@ def test_over_the_wire_as_in_process(exported, tmp_path):
     assert place[2] > 0.2 and excess < 1e-3 and not watchdog
 
 
+WITHOUT_TORCH = """
+import runpy, sys
+for name in ("torch", "warp", "rsl_rl", "mujoco_warp", "tensordict"):
+    sys.modules[name] = None  # importing it raises
+for sys.argv in %r:
+    runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+def test_scripts_without_torch(exported, tmp_path):
+    """What runs on a robot, and replay.py, need none of the packages of training; one file is enough."""
+    file = str(exported / "policy.onnx")
+    calls = [["deploy.py", file, "--interface=sim", "--seconds=0.5", "--log=log.mcap"]]
+    calls += [["replay.py", "log.mcap", f"--policy={file}"], ["sim_robot.py", "--seconds=0.2", "--domain=231"]]
+    calls = [[str(ROOT / "scripts" / script), *words] for script, *words in calls]
+    command = [sys.executable, "-c", WITHOUT_TORCH % calls]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and "bit by bit" in done.stdout
+
+
 def test_scripts(make_task, exported, tmp_path):
     """Both scripts begin and end by themselves; what they are told wrongly is refused in one line."""
     own = [str(exported), "--interface=sim", "--seconds=0.3", "--log=log.mcap"]
@@ -111,13 +131,16 @@ def test_scripts(make_task, exported, tmp_path):
     words = ["--interface=lo", f"--domain={OTHER}", "--seconds=0.3"]
     assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
     status, output, _ = run_here("sim_robot.py", *words, "--fault=hot=FR_hip_joint", "--fault=lost=1", root=tmp_path)
-    assert status == 0 and "damping" in output
+    assert status == 0 and "sport mode normal" in output
     for script, wrong, message in (
         ("deploy.py", ["--interface=none0"], "unknown network interface 'none0'"),
         ("deploy.py", ["--interface=sim", "--rate=333"], "multiple of the policy's 50 Hz"),
         ("deploy.py", ["--interface=sim", "--command", "2", "0", "0"], "lin_vel_x of --command must be from -1 to 1"),
         ("deploy.py", ["--interface=eth0", "--walk"], "a real one waits for its operator"),
         ("deploy.py", ["--interface=sim", "--log=log.mcap"], "cannot write the log 'log.mcap'"),
+        ("deploy.py", ["--interface=sim", "--gamepad=js7"], "cannot open the gamepad 'js7'"),
+        ("deploy.py", ["--interface=sdk", "--power=11"], "--power must be from 1 to 10"),
+        ("deploy.py", ["--interface=sim", "--power=2"], "--power is for --interface sdk"),
         ("sim_robot.py", ["--motors=rael"], "did you mean 'real'?"),
         ("sim_robot.py", ["--fault=lots=1"], "unknown fault 'lots'; did you mean 'lost'?"),
         ("sim_robot.py", ["--fault=dead=FR_hip"], "did you mean 'FR_hip_joint'?"),

@@ -8,31 +8,17 @@ import numpy as np
 import pytest
 from support.exports import export_random
 from support.settings import error_of
+from support.simulated import RATE, robot_of
 
-from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.replay import same_actions, simulate
 from legged_torque.runtime.session import Session
-from legged_torque.runtime.sim_robot import SimRobot
 
-RATE, STAND, WALK = 500.0, 1700, 150  # ticks of each
+STAND, WALK = 1700, 150  # ticks of each
 DEAD = STAND + 60  # tick at which a motor dies
-
-
-def robot_of(policy):
-    """A robot that lies."""
-    return SimRobot(resource_path(policy.description["robot"]["file"]), policy.joint_order, RATE)
-
-
-@pytest.fixture(scope="module")
-def policy(make_task, tmp_path_factory):
-    """A random policy."""
-    folder = tmp_path_factory.mktemp("log") / "out"
-    export_random(make_task, "a1_torque_multihead", folder)
-    return Policy(folder)
 
 
 @pytest.fixture(scope="module")

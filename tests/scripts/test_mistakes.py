@@ -23,10 +23,7 @@ def test_mistakes_when_training(root, words, message):
     assert contents(root) == before
 
 
-@pytest.mark.parametrize(
-    ("script", "words", "message"),
-    TABLES["after training"],
-)
+@pytest.mark.parametrize(("script", "words", "message"), TABLES["after training"])
 def test_mistakes_after_training(root, script, words, message):
     """The other scripts report mistakes in the same way."""
     before = contents(root)

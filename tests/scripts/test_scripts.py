@@ -52,10 +52,7 @@ def test_run_folder(root):
 
 
 def test_resume_in_a_folder_by_its_path(root, tmp_path):
-    """``--load_run`` takes a path, ``--checkpoint`` an earlier checkpoint, and other options still change settings.
-
-    Without ``--max_iterations``, the run goes on to the number of iterations that it was started for.
-    """
+    """``--load_run`` takes a path, ``--checkpoint`` an earlier one; the run goes on to the iterations of its start."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")
     words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--logger=none", "--seed=9"]
     status, output, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)

@@ -11,6 +11,7 @@ from support.settings import error_of
 from support.strangers import Payload
 
 from legged_torque import resource_path
+from legged_torque.deploy.export import write_description
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation
@@ -104,7 +105,7 @@ def test_codes_of_terminals(exported, tmp_path):
     folder = shutil.copytree(exported, tmp_path / "out")
     description = yaml.safe_load((folder / "policy.yaml").read_text())
     description["task"] = description["training"]["run"] = "\x1b[2J\x9b2J\n"
-    (folder / "policy.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    write_description(folder, description)
     status, output, _ = run_here("sim2sim.py", str(folder), "--steps=2", "--robots=1", root=tmp_path)
     assert status == 0 and output.replace("\n", "").isprintable() and output.startswith(r"\x1b[2J\x9b2J\n, model_1.pt")
 

@@ -80,10 +80,7 @@ def test_checkpoint_without_an_end(run):
 
 
 def test_checkpoint_that_is_larger_inside(run):
-    """Neither a compressed archive, nor a number that is repeated for ever, takes the time or memory of its size.
-
-    Of an archive of TorchScript, torch itself would warn.
-    """
+    """Neither compressed archives nor numbers repeated for ever take the memory of their size; no TorchScript."""
     file = run / "model_1.pt"
     with zipfile.ZipFile(file) as whole, zipfile.ZipFile(run / "other.pt", "w", zipfile.ZIP_DEFLATED) as other:
         for name in whole.namelist():

@@ -213,10 +213,7 @@ def policy_of(qpos, qvel, action):
 @pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])
 @pytest.mark.parametrize(("delay", "decimation"), [(0, 4), (2, 4), (5, 2)])
 def test_physics_steps(make_task, in_torch, delay, decimation):
-    """The policy sees the state of some physics steps ago, at most that of the episode's start; the critic the present.
-
-    World 0 starts anew; it may not see what was before.
-    """
+    """The policy sees the state of some physics steps ago, of this episode at most; the critic sees the present."""
     changes = {"sensing.delay.range": [delay, delay], "sensing.delay.jitter": 0, "control.decimation": decimation}
     changes |= {"sensing.delay.loss": 1e-9}  # so that there is a queue without delay, too
     task = make_task("a1_torque", 3, **HIGH_UP, **changes, **{"domain_rand.init_ang_vel": [-2, 2]})

@@ -22,14 +22,10 @@ from support.fused import (
     step_fused,
     step_mujoco,
 )
-from support.settings import error_of
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.envs.base.legged_robot import LeggedRobot
-from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.sim.fused.tree import read_tree
 from legged_torque.sim.model import max_constraints
-from legged_torque.sim.randomization import RandomParameter
 from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import read_spec
@@ -241,18 +237,6 @@ def test_rows_of_closed_loops():
     mujoco.mj_forward(model, data)
     rows = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY).sum()
     assert rows == 10 == max_constraints(model, 0) - max_constraints(compiled(make_a1()), 0)
-
-
-def test_random_parameters_of_the_free_joint():
-    """A task cannot draw what would not act."""
-
-    class Robot(LeggedRobot):
-        def random_parameters(self):
-            return [*super().random_parameters(), RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]})]
-
-    cfg = A1Cfg()
-    cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
-    assert "does not read 'dof_damping' of the trunk's free joint" in error_of(Robot, cfg)
 
 
 def test_tolerance():

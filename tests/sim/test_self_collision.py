@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.fused import assert_alike, put, step_fused, step_mujoco
+from support.fused import assert_alike, compiled, put, step_fused, step_mujoco
 from support.on_device import assert_matches
 from support.published import read_robot
 from support.settings import error_of
@@ -12,7 +12,6 @@ from support.settings import error_of
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.fused.collision_self import MAX_SELF_CONTACTS
-from legged_torque.sim.model import build_model, collision_geoms
 from legged_torque.sim.registry import make_engine
 from legged_torque.utils.mjcf import self_pairs
 
@@ -25,14 +24,6 @@ def make_spec(edit=None):
     if edit is not None:
         edit(spec)
     return spec
-
-
-def compiled(edit=None):
-    """Its model, with a contact sensor on every geom and a solver that converges."""
-    spec = make_spec(edit)
-    model = build_model(spec, collision_geoms(spec))
-    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
-    return model
 
 
 def draw_states(model, num, seed=0):
@@ -66,7 +57,7 @@ def touching(model, states):
 @pytest.fixture(scope="module")
 def thrown():
     """The model, states, and what touches in them."""
-    model = compiled()
+    model = compiled(make_spec())
     states = draw_states(model, 400)
     return model, states, touching(model, states)
 
@@ -87,7 +78,7 @@ def test_matches_plain_mujoco(thrown):
     assert_matches(model, states, actual, expected)
     error = np.abs(actual[0] - expected[0]).max(axis=1)
     assert np.median(error) < 5e-6 and np.quantile(error, 0.98) < 5e-4
-    without = compiled(lambda spec: [setattr(geom, "contype", 0) for geom in spec.geoms if geom.name != "floor"])
+    without = compiled(make_spec(lambda spec: [setattr(g, "contype", 0) for g in spec.geoms if g.name != "floor"]))
     touched = np.array([bool(found) for found in touches])
     assert (np.abs(step_mujoco(without, states)[0] - expected[0]).max(axis=1)[touched] > 0.1).mean() > 0.9
 
@@ -106,7 +97,7 @@ def add_beads(number):
 
 def test_geoms_that_the_floor_lets_through():
     """They touch each other as well, and their sensors see it."""
-    model = compiled(add_beads(3))
+    model = compiled(make_spec(add_beads(3)))
     states = draw_states(model, 40, seed=1)
     expected = step_mujoco(model, states)
     beads = [i - 1 for i in range(model.ngeom) if model.geom_contype[i] == 4]
@@ -117,7 +108,7 @@ def test_geoms_that_the_floor_lets_through():
 def test_too_many_contacts_are_reported():
     """Of more contacts than there is room for the first ones count, and a warning says so."""
     for number, warning in ((1, None), (MAX_SELF_CONTACTS + 1, "NARROWPHASE")):
-        model = compiled(add_beads(number))
+        model = compiled(make_spec(add_beads(number)))
         sim = make_engine("fused", model, 8, "cpu", 100, 50)
         put(sim, draw_states(model, 8, seed=1))
         sim.step()
@@ -166,7 +157,7 @@ def test_pairs_are_mujocos(thrown):
     """Pairs of bodies that a file excludes, parents with their children, and parts of one body are none."""
     model, states, _ = thrown
     everywhere = {frozenset(pair) for pair in self_pairs(model).tolist()}
-    some = compiled(lambda spec: spec.add_exclude(bodyname1="Fshin", bodyname2="Rshin"))
+    some = compiled(make_spec(lambda spec: spec.add_exclude(bodyname1="Fshin", bodyname2="Rshin")))
     assert len(everywhere) - len(self_pairs(some)) == 3  # shin and foot of both, but for the <pair>
     for one, other in (("hull", "Fthigh"), ("Fthigh", "Fshin"), ("hull", "head"), ("Fshin", "Ffoot")):
         assert frozenset((model.geom(one).id, model.geom(other).id)) not in everywhere

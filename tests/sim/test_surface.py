@@ -178,7 +178,7 @@ def test_a_gpu_without_room(monkeypatch):
     """A map that does not fit a GPU's memory is refused before it is made: three times 2601 x 4201 float32 here."""
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**20, 2**30))
     with pytest.raises(UserError, match="needs 135 MiB, and cuda:0 has 1 left"):
-        RoughGround.build(task_registry.get_cfgs("a1_position")[0].terrain, 1, "cuda:0")
+        RoughGround(task_registry.get_cfgs("a1_position")[0].terrain, 1, "cuda:0")
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5])

@@ -39,6 +39,8 @@ class EngineSuite:
     engine: str
     tolerance: float
     """Of the worst velocity after one step of random torques [m/s, rad/s]; half of them are 100 times as accurate."""
+    pushed = "a1"
+    """The robot of :data:`ROBOTS` whose bodies and joints are pushed."""
     height: tuple[float, float] = (0.1, 0.3)
     """Heights of trunks [m] from which all contacts are MuJoCo's."""
 
@@ -276,7 +278,7 @@ class EngineSuite:
     def test_applied_forces(self):
         """Wrenches on all bodies and forces on all degrees of freedom act as in MuJoCo, until a reset."""
         self.need("applied_forces")
-        model = compiled(ROBOTS["crab"]())
+        model = compiled(ROBOTS[self.pushed]())
         states = draw_states(model, 20, self.height)
         xfrc, qfrc = random((20, model.nbody, 6), -5.0, 5.0, 1), random((20, model.nv), -3.0, 3.0, 2)
         sim = self.make(20, model, iterations=(100, 50))

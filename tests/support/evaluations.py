@@ -19,10 +19,7 @@ def read_rows(file):
 
 
 def note_steps(monkeypatch):
-    """Note every control step of every task: its task, the state before, the actions, and the state after.
-
-    There is no warm-up before the first evaluation.
-    """
+    """Note each step of each task: task, state before, actions, state after. Evaluations have no warm-up."""
     monkeypatch.setattr(evaluator, "WARM_UP_TIME", 0.0)
     steps, step = [], LeggedRobot.step
 

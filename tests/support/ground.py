@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from legged_torque.envs.robots.a1 import A1Cfg
-from legged_torque.terrain import make_terrain
+from legged_torque.terrain.rough import make_terrain
 from legged_torque.utils.config import set_by_path, to_dict
 
 
@@ -26,10 +26,10 @@ def make_ground(num_envs=8, **settings):
 
 
 def rays(model, points):
-    """Heights and normals of what MuJoCo's vertical rays meet below points [m]."""
-    data, heights, normals = mujoco.MjData(model), np.empty(len(points)), np.empty((len(points), 3))
+    """Heights of what MuJoCo's vertical rays meet below points [m]."""
+    data, heights = mujoco.MjData(model), np.empty(len(points))
     mujoco.mj_forward(model, data)
     for i, (x, y) in enumerate(points):
         above, down = np.array([x, y, 20.0]), np.array([0.0, 0.0, -1.0])
-        heights[i] = 20.0 - mujoco.mj_ray(model, data, above, down, None, True, -1, None, normals[i])
-    return heights, normals
+        heights[i] = 20.0 - mujoco.mj_ray(model, data, above, down, None, True, -1, None, None)
+    return heights

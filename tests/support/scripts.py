@@ -16,11 +16,7 @@ SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num
 
 
 def run_here(script, *words, root):
-    """Run a script in this process, in the folder ``root``, whose ``logs/`` it writes.
-
-    Returns:
-        Exit status, standard output, standard error without the lines about kernels that are being compiled.
-    """
+    """Run a script in this process in ``root``; return status, output and errors without lines about kernels."""
     output, error, status = io.StringIO(), io.StringIO(), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(output), contextlib.redirect_stderr(error):
         patch.chdir(root)

@@ -14,11 +14,7 @@ from support.scripts import ROOT
 
 
 def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables):
-    """Run code in a terminal of that size; once ``after`` has come, press Ctrl-C or close the terminal.
-
-    Returns:
-        Exit status, and all that the terminal has got.
-    """
+    """Run code in a terminal; once ``after`` has come, press Ctrl-C or close it. Return exit status and output."""
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
     environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}

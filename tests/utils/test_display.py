@@ -84,10 +84,7 @@ def lines_of(output):
 
 @pytest.mark.parametrize(("columns", "variables"), [(120, {}), (60, {"NO_COLOR": "1"})])
 def test_panel(columns, variables):
-    """All numbers are there, nothing is wider than the terminal, and what is printed meanwhile is kept above.
-
-    It is redrawn about once a second, however often there is something new.
-    """
+    """All numbers are there, nothing is too wide, other output is kept above; it is redrawn about once a second."""
     start = time.monotonic()
     status, output = in_a_terminal(TRAINING, columns, **variables)
     assert 2 < output.count("╭") < 6 + (time.monotonic() - start) / REDRAW_EVERY

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from legged_torque.utils import shared_mean
-from legged_torque.utils.errors import LostProcessError
+from legged_torque.utils.errors import UserError
 
 RANKS, ROUNDS = 3, 30
 
@@ -35,7 +35,7 @@ def test_means(monkeypatch):
             return
         try:
             mean.average(torch.zeros(7))
-        except LostProcessError as error:
+        except UserError as error:
             lost.append(str(error))
             for other in mean._others:
                 other.close()

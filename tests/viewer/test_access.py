@@ -19,7 +19,7 @@ from websockets.sync.client import connect
 
 from legged_torque.utils.errors import UserError
 from legged_torque.viewer.access import GuardedServer, is_local
-from legged_torque.viewer.ports import free_port
+from legged_torque.viewer.training_viewer import free_port
 
 FORGED = {
     "box": [{"removed": True}, {"value": "yes"}, {"value": True, "removed": True}, {"no_such": 1}, {"update_cb": []}],

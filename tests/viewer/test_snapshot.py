@@ -38,10 +38,7 @@ def test_torque_parts(make_task, name, parts):
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=NEEDS_GPU)])
 def test_watching_changes_nothing(device):
-    """A watched task does what the task does, and its parts are right in a CUDA graph too.
-
-    On a CPU the bits are the same; on a GPU torch computes the torques, which the physics kernel rounds otherwise.
-    """
+    """A watched task does what the task does (bits on a CPU), and its parts are right in a CUDA graph too."""
     task_class = task_registry.get_task_class("a1_torque_multihead")
     env_cfg, _ = task_registry.get_cfgs("a1_torque_multihead")
     env_cfg.env.num_envs = 2

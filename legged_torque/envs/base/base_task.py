@@ -20,9 +20,8 @@ from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import copy_state
-from legged_torque.utils.config import flat, to_dict
+from legged_torque.utils.config import flat, successor, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.successors import successor
 
 
 class BaseTask(VecEnv):

@@ -5,9 +5,8 @@ import inspect
 from collections.abc import Iterator
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.utils.config import section_keys
+from legged_torque.utils.config import section_keys, successor
 from legged_torque.utils.errors import refuse
-from legged_torque.utils.successors import successor
 
 SIMILAR = 0.88  # share of letters from which on a method seems to be a misspelt hook
 

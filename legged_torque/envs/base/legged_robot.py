@@ -40,7 +40,7 @@ from legged_torque.sensors.sensors import Sensors
 from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.sim.registry import engine_class, make_engine
-from legged_torque.terrain import make_terrain
+from legged_torque.terrain.rough import make_terrain
 from legged_torque.utils.config import section_keys
 from legged_torque.utils.errors import UserError
 

@@ -101,7 +101,6 @@ class FlashSAC:
         self.graphs = {learns: CudaGraph(step, device) for learns, step in steps.items()}
         self._losses: dict[str, Callable] = {"actor": self.actor_loss, "critic": self.critic_loss}
         self._bound: Callable = bound_weights
-        self._follow: Callable = self._move_target
         self.uses_bfloat16 = False
 
     @classmethod
@@ -122,8 +121,7 @@ class FlashSAC:
         alg = cls(actor, critic, replay, settings, algorithm["gamma"], cfg["num_steps_per_env"], symmetry)
         for graph in alg.graphs.values():
             graph.enabled = cfg["capture"]
-        if cfg["capture"]:
-            alg.compile()
+        alg.compile()
         alg.uses_bfloat16 = algorithm["use_mixed_precision"] and torch.device(device).type == "cuda"
         return alg
 
@@ -131,7 +129,7 @@ class FlashSAC:
         """Let losses and what bounds weights run as few kernels, where they can be compiled."""
         device = self.replay.device
         self._losses = {name: compiled(loss, device, learns=True) for name, loss in self._losses.items()}
-        self._bound, self._follow = compiled(self._bound, device), compiled(self._follow, device)
+        self._bound = compiled(self._bound, device, learns=True)
 
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
@@ -211,13 +209,8 @@ class FlashSAC:
         if actor_learns:
             self._descend("actor", batch, self.actor)
         self._descend("critic", batch, self.critic)
-        self._follow()
-
-    @torch.no_grad()
-    def _move_target(self) -> None:
-        """Let the target follow the critic."""
-        for slow, fast in zip(self.target.parameters(), self.critic.parameters(), strict=True):
-            slow.lerp_(fast, self.settings["critic_target_update_tau"])
+        slow, fast = list(self.target.parameters()), [parameter.detach() for parameter in self.critic.parameters()]
+        torch._foreach_lerp_(slow, fast, self.settings["critic_target_update_tau"])
 
     def _sample(self) -> Batch:
         """Return ``mini_batch_size`` samples, and their mirror images if symmetry is used."""

@@ -1,0 +1,150 @@
+"""Those who tell a robot what to do: keys in a terminal, datagrams, a gamepad; and what they see of it."""
+
+import io
+import json
+import os
+import socket
+import struct
+import time
+
+import pytest
+from rich.console import Console
+from support.scripts import ROOT
+from support.settings import error_of
+from support.simulated import standing_at_once
+from support.terminal import in_a_terminal
+
+from legged_torque.runtime import operator
+from legged_torque.runtime.controller import Mode
+from legged_torque.runtime.loop import RealTimeLoop
+from legged_torque.runtime.view import View
+
+STILL = [0.0, 0.0, 0.0]
+
+
+@pytest.fixture
+def robot(policy):
+    """A simulated robot in damping, whose policy was trained for 1 m/s and 1 rad/s at most."""
+    return standing_at_once(policy)
+
+
+def does(robot):
+    """Its mode after some ticks, and its command."""
+    return robot.run(10), robot.controller.velocity_command.round(4).tolist()
+
+
+@pytest.fixture
+def datagrams(robot, monkeypatch):
+    """An operator on a free port, and what sends it something and has it look."""
+    monkeypatch.setattr(operator, "SILENCE", 0.2)
+    with operator.Datagrams(robot.controller, "0") as receiver, socket.socket(type=socket.SOCK_DGRAM) as sender:
+
+        def send(*contents):
+            for content in contents:
+                data = content if isinstance(content, bytes) else json.dumps(content).encode()
+                sender.sendto(data, receiver._socket.getsockname())
+            time.sleep(0.02)
+            receiver.look()
+            return does(robot)
+
+        yield receiver, send
+
+
+BAD = [b"", b"{", b"\xff\xfe", b"[]", b"3", b'{"forward": NaN}', b'{"forward": 1e400}', b'{"forward": true}', b"null"]
+BAD += [b'{"forwards": 1}', b'{"mode": "walk"}', b'{"mode": ["stand"]}', b'{"turn": "1"}', b" " * 300 + b"{}"]
+
+
+def test_commands_of_datagrams(robot, datagrams):
+    """They stay within the trained ranges; bad ones are counted; after silence all is 0, once."""
+    receiver, send = datagrams
+    assert send({"forward": 0.5, "sideways": -0.25, "turn": 9}) == (Mode.DAMPING, [0.5, -0.25, 1.0])
+    assert send({"turn": -0.5}, {"forward": 0.3}, *BAD) == (Mode.DAMPING, [0.3, 0.0, 0.0])
+    assert receiver.note == f"{len(BAD)} bad datagrams"
+    time.sleep(0.25)
+    assert send(*BAD) == (Mode.DAMPING, STILL)  # no signs of life
+    robot.controller.velocity_command[:] = 0.7  # of another operator
+    receiver.look()
+    assert does(robot)[1] == [0.7, 0.7, 0.7]
+    host, port = receiver._socket.getsockname()
+    assert host == "127.0.0.1"
+    for address in (str(port), "70000", "here", "192.0.2.1:9000", "nowhere.invalid:9000"):
+        assert f"not {address}" in error_of(operator.Datagrams, robot.controller, address)
+
+
+def test_modes_of_datagrams(robot, datagrams):
+    """They are asked for once: a stream does not raise a robot again after a fault. Damping is always obeyed."""
+    receiver, send = datagrams
+    for asked, mode in (("policy", "damping"), ("stand", "stand"), ("policy", "policy"), ("stand", "stand")):
+        assert send({"mode": asked}, {"mode": asked})[0] == Mode(mode)
+        assert receiver.note.startswith("no policy now") == (mode == "damping")
+    robot.robot.faults.silent = True
+    assert does(robot)[0] == Mode.DAMPING
+    robot.robot.faults.silent = False
+    does(robot)
+    assert send({"mode": "stand"}, {"mode": "stand"})[0] == Mode.DAMPING
+    assert send({"mode": "damping"}, {"mode": "stand"})[0] == Mode.STAND
+    assert send({"mode": "damping"})[0] == Mode.DAMPING
+    robot.controller.request(Mode.STAND)  # by another operator
+    assert send({"mode": "damping"})[0] == Mode.DAMPING
+
+
+def test_gamepad(robot, tmp_path):
+    """Events as the kernel tells them: sticks with a dead zone, buttons; a device that is gone damps."""
+    file = tmp_path / "js0"
+    os.mkfifo(file)
+    with operator.Gamepad(robot.controller, str(file)) as gamepad, file.open("wb", 0) as device:
+        for events, expected in (
+            ([], (Mode.DAMPING, STILL)),
+            ([(1, 0x81, 0), (30000, 0x82, 1)], (Mode.DAMPING, STILL)),  # how things were at first
+            ([(-32767, 2, 1), (3000, 2, 0), (18022, 2, 3), (1, 2, 2), (1, 1, 0)], (Mode.STAND, [1.0, 0.0, -0.5])),
+            ([(0, 2, 1), (0, 2, 3), (0, 1, 0), (1, 1, 2)], (Mode.POLICY, STILL)),
+            ([(1, 1, 1), (0, 1, 1)], (Mode.DAMPING, STILL)),
+            ([(1, 1, 0)], (Mode.STAND, STILL)),
+        ):
+            device.write(b"".join(struct.pack("<IhBB", 1234, *event) for event in events))
+            gamepad.look()
+            assert does(robot) == expected
+        device.close()
+        gamepad.look()
+        gamepad.look()
+        assert does(robot)[0] == Mode.DAMPING and gamepad.note == "the gamepad is gone"
+
+
+def test_keys(robot, monkeypatch):
+    """As a terminal sends them, also several at once."""
+    master, slave = os.openpty()
+    with open(slave) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        with operator.Keyboard(robot.controller) as keyboard:
+            for keys, *expected in (
+                (b"p\x1b[A\x1b[A,", Mode.DAMPING, [0.2, 0.1, 0.0]),
+                (b"s.\x1b[B\x1b[D", Mode.STAND, [0.1, 0.0, 0.1]),
+                (b"p" + b"\x1b[C" * 20, Mode.POLICY, [0.1, 0.0, -1.0]),
+                (b"0 ", Mode.DAMPING, STILL),
+                (b"x?q", Mode.PASSIVE, STILL),
+            ):
+                os.write(master, keys)
+                keyboard.look()
+                assert [*does(robot)] == expected and keyboard.has_ended == (b"q" in keys)
+    os.close(master)
+
+
+def test_view(robot, exported):
+    """A line and a table of joints against their limits, also of numbers that are none; deploy.py draws it."""
+    unattended = operator.Unattended(robot.controller)
+    view = View(robot, RealTimeLoop(500.0, print), [unattended])
+    for mode in (Mode.STAND, Mode.POLICY, Mode.POLICY):
+        unattended.look()
+        assert does(robot)[0] == mode
+    robot.robot.faults.hot, unattended.note = ["RR_calf_joint"], "something to know"
+    for robot.robot.faults.not_finite in (False, True):
+        does(robot)
+        Console(file=(text := io.StringIO()), width=300).print(view.table())
+        line, _, *rows = text.getvalue().splitlines()
+        by_joint = {row.split()[0]: row for row in rows}
+        assert set(by_joint) == set(robot.controller.joints.names) and " 120 " in by_joint["RR_calf_joint"]
+        assert line.startswith("damping (RR_calf_joint has 120 deg C, too hot)") and "something to know" in line
+    words = [str(ROOT / "scripts" / "deploy.py"), str(exported), "--interface=sim", "--seconds=1", "--udp=0"]
+    code = f"import runpy, sys; sys.argv = {words}; runpy.run_path(sys.argv[0], run_name='__main__')"
+    status, output = in_a_terminal(code, columns=120)
+    assert status == 0 and "of the limit" in output and "FR_hip_joint" in output
