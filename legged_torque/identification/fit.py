@@ -176,13 +176,14 @@ class Problem:
     def half_widths(self, numbers: np.ndarray, equations: Equations) -> np.ndarray:
         """Return 95% intervals either way (n,); a UserError names numbers that are not told, or beyond the search.
 
-        The larger of two estimates: Fisher's, from the matrix, for residuals that are white noise, and a "sandwich" of
-        the gradient's parts by time, which also holds where residuals last because the model is wrong.
+        Fisher's, from the matrix, for residuals that are white noise; that of a "sandwich" of the gradient's parts by
+        time where its variance is more than twice that, since residuals last there: the model is wrong.
         """
         matrix, _, scores = equations
         matrix = matrix + np.diag(1e-6 * self._range**-2)  # for what nothing depends on
         inverse, alone = np.linalg.inv(matrix), QUANTILE * np.diag(matrix) ** -0.5
-        half = QUANTILE * np.sqrt(np.maximum(np.diag(inverse), np.diag(inverse @ scores.T @ scores @ inverse)))
+        sandwich = np.diag(inverse @ scores.T @ scores @ inverse)
+        half = QUANTILE * np.sqrt(np.where(sandwich > 2.0 * np.diag(inverse), sandwich, np.diag(inverse)))
         is_beyond = (numbers >= self._high) | ((numbers <= self._low) & (self._low < 0.0))
         problems = [f"{self._names[number]} is {numbers[number]:.3g} or beyond" for number in np.flatnonzero(is_beyond)]
         for number in np.flatnonzero(half > UNKNOWN * self._range):
