@@ -51,8 +51,11 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--power", type=int, help=hint)
     parser.add_argument("--seconds", type=float, help="end after this time; default: when asked to")
     parser.add_argument("--walk", action="store_true", help="stand up and walk without being asked; simulation only")
+    hint = "in place of the policy, move all joints of a robot that hangs in the air, for identify.py; default: 40 s"
+    parser.add_argument("--chirp", type=float, nargs="?", const=40.0, metavar="SECONDS", help=hint)
     parser.add_argument("--log", type=Path, help="new MCAP file for every tick; replay.py reads it")
     args = parser.parse_args()
+    cli.check_args(args, chirp=Annotated[float, Limits(10, 120)])
     cli.check_args(args, rate=Rate, seconds=Positive, command=list[float], domain=Annotated[int, Limits(0, 232)])
     cli.check_args(args, power=Annotated[int, Limits(1, 10)])
     if args.power and args.interface != "sdk":
@@ -71,7 +74,7 @@ def main() -> None:
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.session import Session
         from legged_torque.runtime.view import View
-    policy = Policy(args.policy)
+    policy = chirp(args, Policy(args.policy)) if args.chirp else Policy(args.policy)
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
     operators = operators_of(args, controller)
@@ -82,6 +85,7 @@ def main() -> None:
         log = Log(args.log, controller)
     session = Session(controller, transport, log)
     loop = RealTimeLoop(args.rate, session.tick)
+    chirps = [policy] if args.chirp else []
     view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
     try:
         with StopRequest(lambda text: None) as stop, loop, contextlib.ExitStack() as devices:
@@ -90,7 +94,7 @@ def main() -> None:
             while not stop.requested and time.monotonic() < end and loop.error is None:
                 for operator in operators:
                     operator.look()
-                if any(operator.has_ended for operator in operators):
+                if any(each.has_ended for each in (*operators, *chirps)):
                     break
                 if log:
                     log.write()
@@ -115,6 +119,15 @@ def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:
     return operators + [kind(controller, address) for kind, address in devices if address]
 
 
+def chirp(args: argparse.Namespace, policy: Any) -> Any:
+    """Return sweeps in place of a policy, once the operator has said that the robot hangs; with sim it does."""
+    from legged_torque.runtime.chirp import Chirp, confirm
+
+    if args.interface != "sim":
+        confirm()
+    return Chirp(policy, args.rate, args.chirp)
+
+
 def connect(args: argparse.Namespace, policy: Any) -> Any:
     """Return the transport to the robot."""
     if args.interface == "sim":
@@ -122,7 +135,7 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
         from legged_torque.runtime.sim_robot import SimRobot
 
         xml = resource_path(policy.description["robot"]["file"])
-        return InProcess(SimRobot(xml, policy.joint_order, args.rate))
+        return InProcess(SimRobot(xml, policy.joint_order, args.rate, hangs=bool(args.chirp)))
     trained = policy.description["robot"]["name"]
     if args.interface == "sdk":
         from legged_torque.runtime.legged_sdk import LeggedSdkRobot

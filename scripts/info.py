@@ -22,6 +22,7 @@ PURPOSES = {
     "viewer": "play.py --viewer web",
     "export": "export.py, sim2sim.py",
     "robot": "robots over DDS",
+    "identify": "identify.py",
     "plots": "figures and report.py",
     "wandb": "--logger wandb",
     "ray": "experiment.py --launcher ray",

@@ -44,7 +44,7 @@ from legged_torque.utils.limits import describe, types_of
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
-LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder", "Network")
+LINKS = ("Ideal", "Drive", "Lag", "Friction", "Thermal", "Quantize", "Muscle", "Encoder", "Network", "Joints")
 SECTIONS = {f"{name}Cfg": f"motors.{name.lower()}." for name in LINKS}
 SECTIONS |= {"CommandsCfg": "commands.", "MotorsCfg": "motors."}
 SECTIONS |= {"FlashSACCfg": "flashsac.", "DistillationCfg": "distillation."}

@@ -13,7 +13,7 @@ from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import loading, set_joints
+from legged_torque.utils.mjcf import hang_up, loading, set_joints
 
 WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
@@ -51,12 +51,19 @@ class SimRobot:
     """
 
     def __init__(
-        self, xml: Path, joint_order: list[str], rate: float, motors: MotorsCfg | None = None, latency: float = 0.0
+        self,
+        xml: Path,
+        joint_order: list[str],
+        rate: float,
+        motors: MotorsCfg | None = None,
+        latency: float = 0.0,
+        hangs: bool = False,
     ) -> None:
         """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second.
 
-        Its motors are ideal unless their settings are given, and commands reach them after ``latency`` [s]. A UserError
-        if the file is unreadable, or the robot has other joints than hips, thighs and calves.
+        Its motors are ideal unless their settings are given, and commands reach them after ``latency`` [s]. If it
+        ``hangs``, it is held by its trunk and touches nothing. A UserError if the file is unreadable, or the robot has
+        other joints than hips, thighs and calves.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -75,6 +82,9 @@ class SimRobot:
         self._steps = round(1.0 / (rate * STEP))
         self._drives = MotorTwin(self._description(motors))
         set_joints(self.model, motors.of_joints(joint_order) if motors else {})
+        if hangs:
+            hang_up(self.model)
+        self._lift = -hangs * self.model.body_mass[1] * self.model.opt.gravity  # [N]
         self._latency, self._on_their_way = latency, deque[tuple[float, MotorCommand]]()
         self._rng, self.faults = np.random.default_rng(0), Faults()
         self.watchdog_ticks, self.excess, self.is_damping = 0, 0.0, True
@@ -91,6 +101,7 @@ class SimRobot:
         folded = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
         self.data.qpos[self._qpos] = np.clip(folded, low, high) if joint_positions is None else joint_positions
         self.data.qpos[2] = 0.15
+        self.data.xfrc_applied[1, :3] = self._lift
         mujoco.mj_forward(self.model, self.data)
 
     def step(self, received: Received) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from legged_torque.utils.errors import UserError
 
 DRAWN_GROUPS = (0, 1, 2)  # of geoms that videos and viewers draw
+HELD = 1e6  # [kg] and [kg m^2] of a trunk that is held
 
 
 @contextlib.contextmanager
@@ -165,6 +166,15 @@ def set_joints(model: mujoco.MjModel, values: Mapping[str, Mapping[str, float]])
             getattr(model, f"dof_{field}")[model.joint(name).dofadr[0]] = value
     if values:
         mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def hang_up(model: mujoco.MjModel) -> None:
+    """Give a model a trunk so heavy that legs do not move it, and no contacts; a force has to carry its weight."""
+    of_robot, inertia = model.geom_bodyid > 0, float(model.stat.meaninertia)
+    model.geom_contype[of_robot] = model.geom_conaffinity[of_robot] = 0
+    model.body_mass[1], model.body_inertia[1], model.body_ipos[1] = HELD, HELD, 0.0
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    model.stat.meaninertia = inertia  # by which solvers judge their progress
 
 
 def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:

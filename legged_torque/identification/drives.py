@@ -1,0 +1,57 @@
+"""The drives of all worlds in a physics step as a kernel: late commands, biased encoders, a trunk that is held."""
+
+import warp as wp
+
+TAU, POS, VEL, KP, KD = (wp.constant(number) for number in range(5))  # rows of a command
+BIAS, DELAY = wp.constant(3), wp.constant(4)  # rows of a candidate
+Rows, Table = wp.array2d(dtype=wp.float32), wp.array3d(dtype=wp.float32)
+
+
+@wp.func
+def asked(commands: Table, step: int, substeps: int, joint: int, pos: float, vel: float) -> float:
+    """tau + Kp (q* - q) + Kd (qd* - qd) [N m] of the command of a physics step, or of the first or last one."""
+    tick = wp.min(wp.max(step, 0) / substeps, commands.shape[0] - 1)
+    torque = commands[tick, TAU, joint] + commands[tick, KP, joint] * (commands[tick, POS, joint] - pos)
+    return torque + commands[tick, KD, joint] * (commands[tick, VEL, joint] - vel)
+
+
+@wp.kernel(enable_backward=False)
+def drive(
+    step: int,
+    substeps: int,  # physics steps per tick
+    rate: float,  # physics steps per second
+    joints: wp.array(dtype=wp.int32),  # places of the log's joints in the model
+    commands: Table,  # (ticks, 5, joints)
+    limits: Rows,  # lowest and highest torques [N m], (2, joints)
+    trunk: wp.array(dtype=wp.float32),  # its position and orientation (7,)
+    candidates: Table,  # (worlds, 5, joints)
+    past: Rows,  # velocities one step ago [rad/s], (worlds, joints)
+    qpos: Rows,
+    qvel: Rows,
+    ctrl: Rows,
+    seen: wp.array4d(dtype=wp.float32),  # (ticks, worlds, 2, joints)
+):
+    """Write the torque of one joint of one world and, at the start of a tick, what its encoder says.
+
+    Semi-implicit steps hold velocities of half a step ago, and a torque acts half a step before and after its time.
+    So velocities are extrapolated by half a step, and a torque is the mean of the commands in its step.
+    """
+    world, place = wp.tid()
+    joint = joints[place]
+    pos = qpos[world, 7 + joint] - candidates[world, BIAS, place]
+    vel = 1.5 * qvel[world, 6 + joint] - 0.5 * past[world, place]
+    past[world, place] = qvel[world, 6 + joint]
+    if step % substeps == 0:
+        seen[step / substeps, world, 0, place] = pos
+        seen[step / substeps, world, 1, place] = vel
+    late = rate * candidates[world, DELAY, place] + 0.5
+    newest = step - int(wp.floor(late))
+    share = late - wp.floor(late)
+    torque = (1.0 - share) * asked(commands, newest, substeps, place, pos, vel)
+    torque += share * asked(commands, newest - 1, substeps, place, pos, vel)
+    ctrl[world, joint] = wp.clamp(torque, limits[0, place], limits[1, place])
+    if place == 0:
+        for i in range(7):
+            qpos[world, i] = trunk[i]
+        for i in range(6):
+            qvel[world, i] = 0.0

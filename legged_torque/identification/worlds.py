@@ -1,0 +1,93 @@
+"""Candidates as worlds of the fused engine: robots whose trunk is held, under the commands of a log."""
+
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.identification.drives import drive
+from legged_torque.identification.recording import Recording
+from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.registry import make_engine
+from legged_torque.utils.errors import refuse, unknown_name
+from legged_torque.utils.mjcf import hang_up
+
+STEP = 1e-3  # [s] longest physics step
+FIELDS = {"armature": "dof_armature", "viscous_friction": "dof_damping", "coulomb_friction": "dof_frictionloss"}
+PARAMETERS = (*FIELDS, "bias", "delay")
+"""Of a joint, as PACE has them [kg m^2, N m s/rad, N m, rad, s]; it stands where the encoder says, plus the bias."""
+
+
+class HangingRobots:
+    """Robots in the air.
+
+    The fused engine needs a free trunk: it weighs 1000 t, a force carries it, and its state is put back before each
+    step; legs accelerate it by 1e-4 m/s^2. That costs nothing, since drives need a kernel before each step
+    anyway, and joints are where a fixed base in plain MuJoCo has them (``tests/identification``). Nothing collides.
+
+    Attributes:
+        num_worlds: How many robots there are: two for each number of a leg and the delay, and one.
+        branches: Joints, by their places in the log, that hang on the trunk one behind the other. With a fixed trunk
+            they do not feel those of other branches.
+        file_values: Parameters in the robot's file; no bias, no delay. Shape: (5, joints).
+        torque_limits: Lowest and highest [N m]. Shape: (2, joints).
+    """
+
+    def __init__(self, cfg: Any, recording: Recording, device: str) -> None:
+        """Hang the robot of a task's settings up as that of a log; a UserError if it lacks joints of the log."""
+        self._recording, wanted = recording, recording.joint_order
+        self._substeps = int(np.ceil(recording.period / STEP - 1e-9))
+        self._step = recording.period / self._substeps
+        asset = load_asset(cfg)
+        model, names = asset.mj_model, asset.dof_names
+        refuse([str(unknown_name("joint of the log", name, names)) for name in wanted if name not in names])
+        self._order = order = [names.index(name) for name in wanted]
+        chains = [[int(joint) - 1 for joint in chain] for chain in read_tree(model).joints]
+        branches = [[order.index(joint) for joint in chain if joint in order] for chain in chains]
+        self.branches = [branch for branch in branches if branch]
+        self.num_worlds = 2 * (4 * max(map(len, self.branches)) + 1) + 1
+        self.torque_limits, none = model.actuator_ctrlrange[order].T, np.zeros(len(order))
+        self.file_values = np.array([*(getattr(model, field)[6:][order] for field in FIELDS.values()), none, none])
+        hang_up(model)
+        model.opt.timestep, sim = self._step, cfg.sim
+        self._engine = make_engine("fused", model, self.num_worlds, device, sim.solver_iterations, sim.ls_iterations)
+        self._fields = [self._engine.field(field, range(6, model.nv)) for field in FIELDS.values()]
+        tables = (recording.commands, self.torque_limits, [0.0, 0.0, 1.0, *recording.quaternion])
+        self._tables = [torch.tensor(order, dtype=torch.int32, device=device), *map(self._tensor, tables)]
+
+    def _tensor(self, values: Any) -> Tensor:
+        """Return numbers on the device, as float32."""
+        return torch.tensor(np.array(values), dtype=torch.float32, device=self._engine.device)
+
+    def run(self, parameters: np.ndarray, ticks: int) -> Tensor:
+        """Return what encoders say in the first ticks of the log.
+
+        Args:
+            parameters: :data:`PARAMETERS` of the joints of all robots. Shape: (num_worlds, 5, joints).
+            ticks: How many ticks, at most those of the log.
+
+        Returns:
+            Positions [rad] and velocities [rad/s] at the start of each tick. Shape: (ticks, num_worlds, 2, joints).
+        """
+        engine, order, model = self._engine, self._order, self._engine.mj_model
+        values, start = self._tensor(parameters), self._tensor(self._recording.measured[0])
+        everywhere = torch.ones(self.num_worlds, dtype=torch.bool, device=engine.device)
+        engine.reset(everywhere)
+        for number, field in enumerate(self._fields):
+            field[:, 6:][:, order] = values[:, number]
+        engine.update_constants(everywhere)
+        past = start[1].repeat(self.num_worlds, 1)
+        engine.qpos[:, 7:][:, order], engine.qvel[:, 6:][:, order] = start[0] + values[:, 3], past
+        engine.applied_forces()[0][:, 1, :3] = self._tensor(-model.body_mass[1] * model.opt.gravity)
+        seen = torch.empty(ticks, *past.shape[:1], 2, len(order), device=engine.device)
+        tensors = [*self._tables, values, past, engine.qpos, engine.qvel, engine.ctrl, seen]
+        inputs = [0, self._substeps, 1.0 / self._step, *map(wp.from_torch, tensors)]
+        launch = wp.launch(drive, past.shape, inputs, device=engine.device, record_cmd=True)
+        for step in range(ticks * self._substeps):
+            launch.set_param_by_name("step", step)
+            launch.launch()
+            engine.step(sense=False)
+        return seen

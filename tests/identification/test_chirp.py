@@ -1,0 +1,71 @@
+"""The motion that drives are identified from, with the brakes of any policy."""
+
+import numpy as np
+import pytest
+from support.exports import export_random
+from support.settings import error_of
+
+from legged_torque import resource_path
+from legged_torque.deploy.policy import Policy
+from legged_torque.identification.recording import read_recording
+from legged_torque.runtime import chirp
+from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.log import Log, RecordedLog
+from legged_torque.runtime.session import Session
+from legged_torque.runtime.sim_robot import SimRobot
+
+RATE, SECONDS = 500.0, 10.0
+
+
+@pytest.fixture(scope="module")
+def policy(make_task, tmp_path_factory):
+    """A random policy."""
+    export_random(make_task, "go2_torque_multihead", folder := tmp_path_factory.mktemp("chirp") / "out")
+    return Policy(folder)
+
+
+def test_targets(policy):
+    """They begin and end at the nominal pose, and stay within shares of ranges, speeds and torques."""
+    sweeps = chirp.Chirp(policy, RATE, SECONDS)
+    targets = np.array([sweeps.act(sweeps.observation(None, None)) for _ in range(round(SECONDS * RATE) + 1)])
+    assert sweeps.has_ended and not targets[[0, -1]].any() and (np.abs(targets).max(axis=0) > 0.2).all()
+    joints = [policy.description["joints"][name] for name in policy.joint_order]
+    room = np.abs(np.array([joint["range"] for joint in joints]).T - policy.nominal_pose).min(axis=0)
+    assert (np.abs(targets).max(axis=0) <= np.minimum(0.25, 0.5 * room) + 1e-6).all()
+    speeds = np.diff(targets, axis=0) * RATE
+    assert (np.abs(speeds).max(axis=0) < 0.3 * np.array([joint["max_velocity"] for joint in joints])).all()
+    torques = policy.stiffness * targets[1:] - policy.damping * speeds
+    assert (np.abs(torques).max(axis=0) < 0.6 * policy.torque_limits[1]).all()
+    crossings = (targets[1:, 0] * targets[:-1, 0] < 0.0).sum()
+    assert crossings == pytest.approx(2 * 5.05 * SECONDS, abs=3)  # two per turn, 5.05 Hz on average
+
+
+def test_hanging_robot(policy, tmp_path):
+    """A simulated robot goes through all of it without a fault, its trunk at rest; the log is for identify.py."""
+    sweeps = chirp.Chirp(policy, RATE, SECONDS)
+    robot = SimRobot(resource_path(policy.description["robot"]["file"]), policy.joint_order, RATE, hangs=True)
+    controller = Controller(sweeps, policy.joint_order, RATE)
+    session = Session(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
+    for tick in range(1700 + round(SECONDS * RATE) + 1):
+        session.tick(tick / RATE, missed=False)
+        if tick in (5, 1700):
+            assert controller.request(Mode.STAND if tick == 5 else Mode.POLICY) == ""
+            before = robot.data.qpos[:7].copy()
+    session.log.close()
+    assert (controller.mode, session.stops, robot.excess) == (Mode.POLICY, [], 0.0)
+    np.testing.assert_allclose(robot.data.qpos[:7], before, atol=0.01)
+    measured = read_recording(RecordedLog(tmp_path / "log.mcap")).measured
+    assert len(measured) == SECONDS * RATE and (np.ptp(measured[:, 0], axis=0) > 0.3).all()
+
+
+def test_refused(policy, monkeypatch):
+    """Nobody who can say that the robot hangs, another answer, and a policy without gains."""
+    assert "needs a terminal" in error_of(chirp.confirm)
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("builtins.input", lambda prompt: "it stands")
+    assert "robots that hang" in error_of(chirp.confirm)
+    monkeypatch.setattr("builtins.input", lambda prompt: "it hangs")
+    chirp.confirm()
+    monkeypatch.setattr(policy, "stiffness", 0.0 * policy.stiffness)
+    assert "stiffness above 0" in error_of(chirp.Chirp, policy, RATE, SECONDS)

@@ -1,0 +1,111 @@
+"""Identification of a leg: known numbers are found, with intervals; what a log does not tell is refused by name."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from conftest import NUMBERS, POSE, TILT, TRUTH, noisy, record, sweep, write_log
+from support.scripts import run_here
+from support.settings import error_of
+
+from legged_torque.envs import task_registry
+from legged_torque.envs.base.asset import load_asset
+from legged_torque.identification import fit
+from legged_torque.identification.recording import Recording
+from legged_torque.identification.worlds import FIELDS, HangingRobots
+from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.utils.options import Options
+
+
+def test_the_trunk_is_fixed(leg):
+    """Worlds are where a robot on a fixed, tilted trunk is in plain MuJoCo, in any order of the joints."""
+    known, order = record(leg, sweep(1.5), step=1e-3, half=0.5), [2, 0, 1]
+    shuffled = [known.joint_order[place] for place in order]
+    recording = Recording(shuffled, known.period, TILT, known.commands[..., order], known.measured[..., order])
+    robots = HangingRobots(leg, recording, "cpu")
+    assert robots.branches == [[1, 2, 0]]
+    seen = robots.run(np.tile(TRUTH[:, order], (robots.num_worlds, 1, 1)), len(known.commands)).numpy()
+    np.testing.assert_allclose(seen[:, 5], known.measured[..., order], atol=3e-5)
+    np.testing.assert_array_equal(seen[:, 0], seen[:, -1])
+
+
+@pytest.fixture(scope="module")
+def found(leg, tmp_path_factory):
+    """What identify.py finds in a noisy log of drives with loops of 10 kHz; what it prints, and its settings."""
+    folder, (kind, _, training) = tmp_path_factory.mktemp("found"), task_registry._tasks["go2_torque"]
+    write_log(folder / "chirp.mcap", noisy(record(leg, sweep(8.0))), "one_leg")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(task_registry._tasks, "one_leg", (kind, leg, training))
+        patch.setattr(fit, "GENERATIONS", 2)
+        words = ("chirp.mcap", "--json", "found.json", "--device", "cpu")
+        status, output, error = run_here("identify.py", *words, root=folder)
+        assert status == 0, error
+        cfg = task_registry.get_cfgs("one_leg", Options(device="cpu", motors=str(folder / "chirp.yaml")))[0]
+    content = json.loads((folder / "found.json").read_text())
+    return {name: np.array(value) for name, value in content.items()}, output, cfg
+
+
+def test_known_numbers(found):
+    """Each is within 5%, the delay within a tenth of a physics step; where nothing was fitted, errors are the noise."""
+    result, output, _ = found
+    np.testing.assert_allclose(result["values"][:4], TRUTH[:4], rtol=0.05)
+    np.testing.assert_allclose(result["values"][4], 0.005, atol=1e-4)
+    np.testing.assert_allclose(result["noise"], [[5e-4] * 3, [0.05] * 3], rtol=0.05)
+    before, after = result["held_out"]
+    np.testing.assert_allclose(after, [[5e-4] * 3, [0.05] * 3], rtol=0.1)
+    assert (before[0] > 20 * after[0]).all()
+    assert re.search(r"FR_thigh_joint +0.02[34]\d* \+- 1?\de-0[56] ", output) and re.search(
+        r"delay \d.\d\d \+-", output
+    )
+
+
+def test_settings(found):
+    """``--motors`` gives these numbers to trainings, which draw none of them, and to the simulated robot."""
+    result, _, cfg = found
+    for model in (load_asset(cfg).mj_model, SimRobot(cfg.asset.file, list(POSE), 500.0, motors=cfg.motors).model):
+        joints = [getattr(model, field)[6:] for field in FIELDS.values()]
+        np.testing.assert_allclose(joints, result["values"][:3], rtol=1e-3)
+    assert (cfg.motors.delay.unit, cfg.motors.delay.range) == ("milliseconds", [5, 5])
+    assert cfg.domain_rand.keep_fixed == ["dof_armature", "dof_damping", "dof_frictionloss"]
+    assert cfg.domain_rand.joint_offset["add"][1] == pytest.approx(0.055, rel=0.05)
+
+
+def problem_of(leg, recording):
+    """The problem of a recording."""
+    return fit.Problem(HangingRobots(leg, recording, "cpu"), recording)
+
+
+def test_intervals(leg):
+    """Of 13 numbers in three logs, 34 or more are within their 95% intervals, and not all by far."""
+    known, errors = record(leg, sweep(5.0), step=1e-3, half=0.5), []
+    for seed in range(3):
+        problem = problem_of(leg, noisy(known, seed))
+        numbers, _, equations = problem.refine(NUMBERS * 1.01, lambda: None)
+        errors.append(np.abs(numbers - NUMBERS) / problem.half_widths(numbers, equations))
+    assert (np.array(errors) < 1.0).sum() >= 34 and (np.array(errors) > 0.3).sum() >= 10
+
+
+STILL, STEADY = sweep(6.0, last=1.0), np.array(list(POSE.values())) + 1e-4 * np.arange(3000)[:, None]
+STILL[:, 2] = POSE["FR_calf_joint"]
+
+
+@pytest.mark.parametrize(
+    ("targets", "bias", "problems"),
+    [
+        (STILL, -0.047, [f"{kind}_friction of FR_calf.* the joint hardly moves" for kind in ("viscous", "coulomb")]),
+        (STEADY, -0.047, ["viscous_friction of (FR.*joint) .* told from coulomb_friction of", "delay"]),
+        (STEADY, -0.047, ["armature of FR_calf_joint .*: the joint hardly accelerates"]),
+        (sweep(6.0, amplitude=0.01), -0.047, ["delay .*: nothing moves fast"]),
+        (sweep(6.0), -0.1, ["bias of FR_hip_joint is -0.1 or beyond"]),
+    ],
+)
+def test_refused(leg, targets, bias, problems):
+    """A joint at rest, a single low speed, a motion too small, a number at the end of what is searched."""
+    problem, numbers = (
+        problem_of(leg, noisy(record(leg, targets, step=1e-3))),
+        np.where(NUMBERS == -0.047, bias, NUMBERS),
+    )
+    parts = error_of(problem.half_widths, numbers, problem._linearized(numbers)[1]).split("; ")
+    assert all(any(re.match(expected, part) for part in parts) for expected in problems), parts
+    assert targets is not STILL or all(" of FR_calf_joint is known to +-" in part for part in parts)
