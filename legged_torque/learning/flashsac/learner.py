@@ -210,7 +210,7 @@ class FlashSAC:
             self._descend("actor", batch, self.actor)
         self._descend("critic", batch, self.critic)
         slow, fast = list(self.target.parameters()), [parameter.detach() for parameter in self.critic.parameters()]
-        torch._foreach_lerp_(slow, fast, self.settings["critic_target_update_tau"])
+        torch._foreach_lerp_(slow, fast, self.settings["critic_target_update_tau"])  # type: ignore[arg-type]
 
     def _sample(self) -> Batch:
         """Return ``mini_batch_size`` samples, and their mirror images if symmetry is used."""
