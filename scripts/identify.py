@@ -2,9 +2,9 @@
 
 Examples:
     python scripts/identify.py chirp.mcap                       # prints a table, writes chirp.yaml
-    python scripts/train.py --task=go2_torque --motors chirp.yaml --max_iterations 20
 
-Minutes on a CPU. docs/howto/identify.md says how to make such a log, and what the numbers are worth.
+Minutes on a CPU. Train with what it found: train.py --motors chirp.yaml. docs/howto/identify.md says how to make such a
+log, and what the numbers are worth.
 """
 
 import argparse

@@ -17,15 +17,16 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_launcher import write_files
+from legged_torque.experiments.ray_node import write_files
 
 FAST = {
+    "worker_niceness": 0,  # by default they wait for all other tests
     "health_check_initial_delay_ms": 0,
     "health_check_period_ms": 200,
     "health_check_timeout_ms": 60_000,  # for an answer: a machine that is just slow is not gone
     "health_check_failure_threshold": 2,
 }
-"""Settings by which Ray soon notices that a machine is gone: nothing answers there."""
+"""Settings by which Ray soon notices that a machine is gone, since nothing answers there, and does not yield."""
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +84,12 @@ def during(stage, out, act):
 
     def wait_and_act():
         """Wait, in a thread of its own."""
-        wait_for(lambda: len(list(out.glob("*/run_0/model_2.pt"))) == 2, 60)
-        act()
+        try:
+            wait_for(lambda: len(list(out.glob("*/run_0/model_2.pt"))) == 2, 120)
+            act()
+        except BaseException:
+            (stage / "scripts" / "behaviour").write_text("")  # they would wait forever
+            raise
 
     thread = threading.Thread(target=wait_and_act)
     thread.start()
