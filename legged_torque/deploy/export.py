@@ -14,7 +14,7 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor
 
-from legged_torque import RESOURCES_DIR, __version__
+from legged_torque import RESOURCES_DIR
 from legged_torque.deploy.description import (
     DESCRIPTION_FILE,
     FORMAT_VERSION,
@@ -223,7 +223,7 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         "unsupported": [],
         "robot": {"name": file.stem, "file": file.as_posix(), "trunk": mj_model.body(1).name}
         | {"mass": round(float(mj_model.body_mass.sum()), 6), "self_collisions": asset.self_collisions},
-        "versions": package_versions() | {"legged_torque": __version__},
+        "versions": package_versions(),
         "training": training,
         "network": {"file": NETWORK_FILE, "torchscript": TORCHSCRIPT_FILE, "input": "obs", "output": "actions"}
         | {"num_observations": model.obs_dim, "num_actions": task.num_actions}

@@ -110,7 +110,9 @@ def versions_here() -> dict[str, str]:
     package = [file for file in sorted(folder.rglob("*.py")) if scripts not in file.parents]  # a wheel holds both
     for file in (*package, *sorted(scripts.glob("*.py"))):
         digest.update(file.read_bytes())
-    return {**package_versions(), "code of legged_torque": digest.hexdigest()[:12]}
+    versions = package_versions() | {"code of legged_torque": digest.hexdigest()[:12]}
+    del versions["legged_torque"]  # says less
+    return versions
 
 
 def check_versions(machine: str, wanted: dict[str, str], found: dict[str, str]) -> None:

@@ -2,16 +2,21 @@
 
 import contextlib
 import errno
+import functools
 import importlib.metadata
 import math
 import platform
+import shlex
 import shutil
+import subprocess
+import sys
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from legged_torque import __version__
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, write_errors, write_whole
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
@@ -23,7 +28,7 @@ MOVED = {"legged_torque.control.gravity_pretraining:pretrain": "legged_torque.pa
 """Present names of functions that the settings of older runs name by their former modules."""
 NAME, NAME_LENGTH = "%Y-%m-%d_%H-%M-%S", 19  # of a run, by its start, in local time; in characters
 _CHECKPOINT = "model_"
-_PACKAGES = ("legged_torque", "torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
+_PACKAGES = ("torch", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib", "numpy")
 
 
 def new_run_dir(log_root: Path, run_name: str) -> Path:
@@ -141,8 +146,9 @@ def checkpoint_numbers(run_dir: Path) -> list[int]:
 
 
 def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
-    """Write the settings of a run and the versions of the packages that it uses, between YAML's marks of a document."""
-    content = {**config, "versions": package_versions()}
+    """Write a run's settings, its command, and the versions of packages, between YAML's marks of a document."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    content = {**config, "command": command, "versions": package_versions()}
     text = yaml.dump(content, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
     write_whole(Path(run_dir) / CONFIG_FILE, text.encode())
 
@@ -179,11 +185,29 @@ def steps_per_iteration(config: dict[str, Any]) -> int | None:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that decide how a training goes."""
+    """Return the versions of Python and of the packages that decide how a training goes.
+
+    That of this package has the commit of a checkout, and whether files were changed since: "0.1.0+g62a7aea.dirty".
+    """
     versions = {"python": platform.python_version()}
     for package in _PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             versions[package] = "not installed"
+    versions["legged_torque"] = __version__ + commit()
     return versions
+
+
+@functools.cache
+def commit() -> str:
+    """Return what a checkout adds to the version; empty without git, and for an installed package."""
+    root = Path(__file__).resolve().parents[2]
+    words = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
+    if not (root / ".git").exists():
+        return ""
+    try:
+        done = subprocess.run(words, capture_output=True, text=True)
+    except OSError:
+        return ""
+    return f"+g{done.stdout.strip().replace('-', '.')}" if done.returncode == 0 else ""

@@ -1,6 +1,7 @@
 """Run folders: found, read, and refused when they are broken."""
 
 import os
+import subprocess
 import time
 import zipfile
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import yaml
 from support.settings import error_of, flatten, get_cfgs
 
+from legged_torque import __version__
 from legged_torque.utils import runs
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.files import write_whole
@@ -61,10 +63,11 @@ def test_find_checkpoint_that_does_not_exist(log_root):
 
 
 @pytest.mark.parametrize("task", ["a1_position", "a1_torque_gravity_multihead"])
-def test_config_file_round_trip(task, tmp_path):
+def test_config_file_round_trip(task, tmp_path, monkeypatch):
     """What a run has written gives the same settings again, of the same types; versions of all packages are there."""
     words = ["--preset=paper", "--set=rewards.scales.torques=-1e-7", "--set=actor.hidden_dims=[8, 4]", "--run_name=7"]
     env_cfg, train_cfg = get_cfgs(*words, task=task)
+    monkeypatch.setattr("sys.argv", ["scripts/train.py", "--run_name", "a b"])
     runs.save_config(tmp_path / "run", {"task": task, "env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     assert "!!" not in (tmp_path / "run" / "config.yaml").read_text()  # any program reads it
     config = runs.load_config(tmp_path / "run")
@@ -75,7 +78,28 @@ def test_config_file_round_trip(task, tmp_path):
         assert {key: type(value) for key, value in new.items()} == {key: type(value) for key, value in old.items()}
     assert config["task"] == task
     assert config["versions"]["numpy"] == np.__version__
-    assert {"python", "torch", "legged_torque", "mujoco", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
+    assert {"python", "torch", "mujoco", "warp-lang", "rsl-rl-lib"} <= config["versions"].keys()
+    assert config["versions"]["legged_torque"].startswith(__version__)
+    assert config["command"] == "train.py --run_name 'a b'"
+
+
+def test_commits_in_versions(tmp_path, monkeypatch):
+    """Of a checkout: its commit, and whether files have changed since; none without git, or for another's checkout."""
+    where = tmp_path / "legged_torque" / "utils" / "runs.py"
+    where.parent.mkdir(parents=True)
+    where.write_text("x = 1")
+    monkeypatch.setattr(runs, "__file__", str(where))
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-C", str(tmp_path)]
+    assert runs.commit.__wrapped__() == ""
+    for words in (["init"], ["add", "."], ["commit", "-m", "one"], ["tag", "v7"]):
+        subprocess.run([*git, *words], check=True, capture_output=True)
+    number = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True).stdout
+    clean = runs.commit.__wrapped__()
+    assert clean.startswith("+g") and number.startswith(clean[2:]) and len(clean) >= 9
+    where.write_text("x = 2")
+    assert runs.commit.__wrapped__() == f"{clean}.dirty"
+    monkeypatch.setenv("PATH", "")
+    assert runs.commit.__wrapped__() == ""
 
 
 @pytest.mark.parametrize(

@@ -43,6 +43,7 @@ from legged_torque.terrain.selection import select_tiles
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.viewer.web import Page
 
+pytestmark = pytest.mark.timeout(900)  # [s]
 TIMEOUT = 150.0  # seconds that the page may take for something; a picture takes 10 on a busy machine
 OPTIONS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
