@@ -19,7 +19,7 @@ setup(
         "legged_torque.importer": ["scene.xml"],
         "legged_torque.utils": ["successors.yaml"],
         "legged_torque.viewer": ["page.js"],
-        "legged_torque.resources": ["robots/**"],
+        "legged_torque.resources": ["policies/**", "robots/**"],
         "legged_torque.descriptions": ["*.yaml"],
         "legged_torque.paper.report": ["*.jinja"],
     },

@@ -57,6 +57,8 @@ def main() -> None:
     if args.list is not None:
         print("\n".join(list_tasks(args.list)))
         return
+    if options.policy:
+        raise UserError("--policy is for play.py, evaluate.py and export.py: its checkpoint holds the actor alone")
     if options.resume:
         if options.preset:
             raise UserError("--preset cannot be given with --resume, which keeps the settings of the run")

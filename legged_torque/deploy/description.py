@@ -12,6 +12,7 @@ import yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
+from legged_torque.utils.policies import policy_dir, policy_names
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
@@ -23,12 +24,15 @@ SCHEMA: dict[str, Any] = json.loads(Path(__file__).with_name("policy.schema.json
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """Read and check the description of a policy; return it and the file of the network.
 
-    ``path`` is ``policy.yaml``, a network in its folder, or that folder; a network alone describes itself. A UserError
-    names what is missing or wrong.
+    ``path`` is ``policy.yaml``, a network in its folder, that folder, or the name of a policy that comes along; a
+    network alone describes itself. A UserError names what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
-        raise UserError(f"there is no file or folder '{path}'")
+        if path.as_posix() not in policy_names():
+            names = ", ".join(policy_names())
+            raise UserError(f"there is no file or folder '{path}', nor does a policy of that name come along: {names}")
+        path = policy_dir(path.as_posix())
     folder, is_network = path if path.is_dir() else path.parent, path.suffix == ".onnx"
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
     network = path if is_network else folder / NETWORK_FILE

@@ -13,12 +13,12 @@ LARGEST_ASKED = 10.0  # times its limit: a torque beyond this is a mistake, not 
 class Brakes:
     """Numbers that end a walk, and those of the damping in which it ends."""
 
-    max_age: float = 0.015  # of the newest state [s]
+    max_age: float = 0.013  # of the newest state [s]
     max_tilt: float = 1.0  # of the trunk from upright [rad]
     max_overrun: float = 0.1  # of a joint beyond its range [rad]
     max_temperature: float = 90.0  # of a motor [deg C]
     max_damaged: int = 3  # messages with a wrong checksum since the last whole one
-    max_missed: int = 3  # deadlines in a row
+    max_missed: float = 0.014  # seconds in which every deadline was missed
     torque_rate: float = 2000.0  # most by which a torque changes [N m/s]
     ramp: float = 0.5  # seconds in which a policy takes over from standing
     stand_up: float = 3.0  # seconds from any pose to the nominal one

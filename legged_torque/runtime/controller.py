@@ -50,7 +50,7 @@ class Controller:
         self.mode, self.reason = Mode.DAMPING, ""
         self.state: RobotState | None = None
         self.velocity_command = np.zeros(3)
-        self._since, self._state_time, self._now, self._missed, self._damaged = 0.0, -np.inf, 0.0, 0, 0
+        self._since, self._state_time, self._now, self._on_time, self._damaged = 0.0, -np.inf, 0.0, 0.0, 0
         self._problems: list[str] = []  # of the last look
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
         self.sent, self._lock = self._gentle(0.0), threading.Lock()
@@ -123,7 +123,7 @@ class Controller:
 
     def _step(self, received: Received, now: float, missed: bool) -> MotorCommand:
         """Do what :meth:`step` says, if all goes well."""
-        self._now, self._missed = now, self._missed + 1 if missed else 0
+        self._now, self._on_time = now, self._on_time if missed else now
         if isinstance(received.newest, RobotState):
             self.state, self._state_time, self._damaged = received.newest, now, 0
         self._damaged += received.wrong_crc
@@ -140,6 +140,8 @@ class Controller:
         if problem := mistake(command, state, self.joints):
             self.stop(problem)
             return self._gentle(self.brakes.damping)
+        if self.mode == Mode.POLICY:
+            command = self._taking_over(command)
         before = np.clip(torques_of(self.sent, state), *self.joints.torque_limits)
         return limited(command, state, before, self.brakes.torque_rate * self.period, self.joints)
 
@@ -147,8 +149,8 @@ class Controller:
         """Return why the robot must not move."""
         if self.state is None:
             return "the robot has not said anything yet"
-        if self._missed > self.brakes.max_missed:
-            return f"{self._missed} deadlines were missed in a row"
+        if (late := self._now - self._on_time) > self.brakes.max_missed + 1e-6:
+            return f"all deadlines of {1e3 * late:.0f} ms were missed"
         seen = Received(None, self._damaged, problems=self._problems)
         return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)
 
@@ -167,7 +169,7 @@ class Controller:
         return MotorCommand(zeros, target, zeros, zeros + kp, zeros + kd)
 
     def _walking(self, state: RobotState) -> MotorCommand:
-        """Return the policy's command; at first it takes over from standing bit by bit."""
+        """Return the policy's command."""
         policy, to_policy = self.policy, np.argsort(self._order)
         if self._tick % self._ticks_per_action == 0:
             joints = state.joint_positions[to_policy], state.joint_velocities[to_policy]
@@ -177,7 +179,10 @@ class Controller:
             self.policy_step = PolicyStep(obs, self._actions, is_first=self._tick == 0)
         self._tick += 1
         tau, q, kp, kd = (part[self._order] for part in policy.drive_targets(self._actions))
-        command = MotorCommand(tau, q, np.zeros(len(q)), kp, kd)
+        return MotorCommand(tau, q, np.zeros(len(q)), kp, kd)
+
+    def _taking_over(self, command: MotorCommand) -> MotorCommand:
+        """Return a mixture of the policy's command, which takes over bit by bit at first, and of standing."""
         share = min(1.0, (self._now - self._since) / self.brakes.ramp)
         standing = self._standing(np.inf)
         parts = zip(vars(standing).values(), vars(command).values(), strict=True)

@@ -23,17 +23,18 @@ from legged_torque.utils.errors import LOST_PROCESS, TrainingError, UserError, i
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import Rate, check_value, describe, types_of
 from legged_torque.utils.options import DEFAULT_TASK, Options
+from legged_torque.utils.policies import policy_names
 from legged_torque.utils.task_registry import task_registry
 
 LAST_WORDS = 2.0  # seconds after which a further process reports an error that the first one has not reported
 COMMAND = "legged-torque"  # the console command that runs every script
 CLOCKS = ("policy_hz", "physics_hz")  # options in Hz
 SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file", *CLOCKS)  # of every task
-RUNS = ("load_run", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
+RUNS = ("load_run", "policy", "checkpoint", "log_root", "experiment_name")  # of scripts that keep or load runs
 TRAINING = ("max_iterations", "resume", "preset", "run_name", "logger", "verbose")  # of trainings alone
 _GROUPS = {"task and settings": ("task", "num_envs", *SETTINGS[1:]), "training": TRAINING, "runs": RUNS}
 _TASK_OF_RUN = f"name of the task, see train.py --list; default: that of the run, or {DEFAULT_TASK} for a new one"
-_COMPLETED = ("task", "preset", "perturbation", "ranges", "motors", "set", "terrain")
+_COMPLETED = ("policy", "task", "preset", "perturbation", "ranges", "motors", "set", "terrain")
 _SCRIPT = re.compile(r"python scripts/(\w+)\.py")
 _EXAMPLE = re.compile(r": ``(python scripts/[^`]+)``\.")
 
@@ -159,6 +160,7 @@ def complete(action: argparse.Action, parsed_args: argparse.Namespace, **_: Any)
         "ranges": env_cfg.parameter_ranges(),
         "motors": env_cfg.motors.choices,
         "set": [f"{path}=" for path in flat(to_dict(env_cfg) | to_dict(train_cfg))],
+        "policy": policy_names(),
         "terrain": ["all", *section_keys(env_cfg.terrain.terrain_proportions)],
     }
     return list(words[action.dest])

@@ -27,6 +27,7 @@ from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, printable, unknown_name
 from legged_torque.utils.files import remove_stale_parts
 from legged_torque.utils.options import Options, apply_options
+from legged_torque.utils.policies import policy_dir
 from legged_torque.utils.runs import (
     checkpoint_number,
     checkpoint_numbers,
@@ -207,11 +208,14 @@ class TaskRegistry:
 
         A UserError if there is none, it is unreadable or of another task.
         """
+        if options.policy and options.load_run:
+            raise UserError("--policy and --load_run exclude each other")
+        chosen = str(policy_dir(options.policy)) if options.policy else options.load_run
         experiment = options.experiment_name
         if options.task and not experiment:
             experiment = self.get_cfgs(options.task)[1].runner.experiment_name
         root, pattern = Path(options.log_root or LOGS, experiment or ""), "*" if experiment else "*/*"
-        folder = find_run(root, options.load_run, pattern)
+        folder = find_run(root, chosen, pattern)
         config = load_config(folder)
         task = str(config["task"])
         if options.task and task != options.task:
@@ -223,7 +227,7 @@ class TaskRegistry:
 
             print_notes(robot_notes(resource_path(robot), resource_path(trained)))
         file = find_checkpoint(folder, options.checkpoint)
-        newer_runs = not options.load_run and any(
+        newer_runs = not chosen and any(
             run.name > folder.name and checkpoint_numbers(run) for run in root.glob(pattern)
         )
         if newer_runs or (options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]):

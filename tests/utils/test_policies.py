@@ -1,0 +1,62 @@
+"""Policies that come along: their cards hold, and what has been changed is refused."""
+
+import json
+import math
+import shutil
+
+import pytest
+from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
+
+from legged_torque.utils import policies
+from legged_torque.utils.policies import CARD, POLICIES_DIR, policy_dir, policy_names, read_card
+
+NAMES = policy_names()
+APART = 4.0  # standard errors of a difference
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_cards(name, tmp_path):
+    """A new evaluation, in other worlds, agrees with each; every file has its checksum."""
+    folder = policy_dir(name)
+    card = read_card(folder)
+    assert {*card["files"], CARD} == {path.name for path in folder.iterdir()} and card["policy"] == name
+    words = [f"--policy={name}", "--device=cpu", "--num_envs=16", "--steps=500", "--seed=7", "--json=measured.json"]
+    status, _, error = run_here("evaluate.py", *words, root=tmp_path)
+    assert status == 0, error
+    measured = json.loads((tmp_path / "measured.json").read_text())["metrics"]
+    for metric in ("track_percentage", "track_xy", "height", "mechanical_power"):
+        mean, deviation = card["metrics"][metric]
+        here = measured[metric]
+        assert abs(here["mean"] - mean) <= APART * math.hypot(deviation, here["standard_error"]), metric
+
+
+def test_scripts(tmp_path):
+    """Names are taken in place of runs and exports, and listed."""
+    name = NAMES[0]
+    status, output, _ = run_here("policies.py", root=tmp_path)
+    assert status == 0 and all(each in output for each in NAMES)
+    status, output, _ = run_here("sim2sim.py", name, "--steps=50", "--robots=1", root=tmp_path)
+    assert status == 0 and "track_percentage" in output
+    assert run_here("export.py", f"--policy={name}", "--out=out", root=tmp_path)[0] == 0
+    assert (tmp_path / "out" / "policy.onnx").is_file()
+    for script, words, message in (
+        ("play.py", [f"--policy={name[:-1]}"], f"did you mean '{name}'?"),
+        ("demo.py", [name[:-1]], f"did you mean '{name}'?"),
+        ("play.py", [f"--policy={name}", "--load_run=x"], "--policy and --load_run exclude each other"),
+        ("train.py", [f"--policy={name}"], "--policy is for play.py, evaluate.py and export.py"),
+        ("sim2sim.py", [name[:-1]], f"nor does a policy of that name come along: {NAMES[0]}"),
+    ):
+        assert_told_in_one_line(run_here(script, *words, root=tmp_path), message)
+
+
+def test_changed_files(tmp_path, monkeypatch):
+    """A file that is not the one that was measured is refused, as is a missing one."""
+    shutil.copytree(POLICIES_DIR, tmp_path / "policies")
+    monkeypatch.setattr(policies, "POLICIES_DIR", tmp_path / "policies")
+    file = tmp_path / "policies" / NAMES[0] / "policy.onnx"
+    assert policy_dir(NAMES[0]) == file.parent
+    file.write_bytes(file.read_bytes() + b"\0")
+    assert error_of(policy_dir, NAMES[0]) == f"'{file}' is not the file that card.yaml describes"
+    file.unlink()
+    assert str(file) in error_of(policy_dir, NAMES[0])
