@@ -1,4 +1,4 @@
-"""Steer a robot on a page, with a policy that comes along: no GPU, no training.
+"""Steer a robot on a page, with a bundled policy: no GPU, no training.
 
 Examples:
     python scripts/demo.py                    # a Go2 on rough ground

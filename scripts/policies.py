@@ -1,4 +1,4 @@
-"""List the trained policies that come along: ``python scripts/policies.py``.
+"""List the bundled policies: ``python scripts/policies.py``.
 
 Each is a folder below resources/policies, whose card.yaml says how it was trained and measured. play.py, evaluate.py
 and export.py take one as --policy, sim2sim.py and deploy.py in place of a file.

@@ -1,4 +1,4 @@
-"""Pack a checkpoint of a run as a policy that comes along: ``python tools/pack_policy.py RUN go2/torque_multihead``.
+"""Pack a checkpoint of a run as a bundled policy: ``python tools/pack_policy.py RUN go2/torque_multihead``.
 
 The folder gets the actor, its export, the settings, and a card with what ``evaluate.py`` measures and checksums.
 """

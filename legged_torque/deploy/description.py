@@ -24,14 +24,14 @@ SCHEMA: dict[str, Any] = json.loads(Path(__file__).with_name("policy.schema.json
 def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """Read and check the description of a policy; return it and the file of the network.
 
-    ``path`` is ``policy.yaml``, a network in its folder, that folder, or the name of a policy that comes along; a
+    ``path`` is ``policy.yaml``, a network in its folder, that folder, or the name of a bundled policy; a
     network alone describes itself. A UserError names what is missing or wrong.
     """
     path = Path(path)
     if not path.exists():
         if path.as_posix() not in policy_names():
             names = ", ".join(policy_names())
-            raise UserError(f"there is no file or folder '{path}', nor does a policy of that name come along: {names}")
+            raise UserError(f"there is no file or folder '{path}', nor a bundled policy of that name: {names}")
         path = policy_dir(path.as_posix())
     folder, is_network = path if path.is_dir() else path.parent, path.suffix == ".onnx"
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path

@@ -69,7 +69,7 @@ class Options:
     run_name: str | None = _option("added to the name of the run's folder")
     logger: str | None = _option("where curves are written: tensorboard, wandb or none")
     load_run: str | None = _option("run to load: name of its folder or a path; default, and -1: the last one")
-    policy: str | None = _option("policy that comes along, in place of a run, such as go2/position; see policies.py")
+    policy: str | None = _option("bundled policy in place of a run, such as go2/torque_multihead; see policies.py")
     checkpoint: Number | None = _option("checkpoint to load; default, and -1: the last one")
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
