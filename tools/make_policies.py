@@ -1,0 +1,107 @@
+"""Train, measure and pack the bundled policies: ``python tools/make_policies.py go2/torque_multihead``.
+
+A folder of resources/policies gets the actor of the last checkpoint, its export, the settings, and a card with
+measurements and checksums. All of them take some twenty minutes on two GPUs that train five each at a time.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+from legged_torque import SCRIPTS_DIR
+from legged_torque.learning import checkpoint
+from legged_torque.utils import cli
+from legged_torque.utils.devices import device_name, resolve_device
+from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.files import write_whole
+from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.policies import CARD, POLICIES_DIR, sha256
+from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint, find_run, load_config
+
+ROBOTS = ("a1", "go1", "go2", "anymal_c", "g1")
+NAMES = [f"{robot}/{ground}{approach}" for robot in ROBOTS for ground in ("", "rough_")
+         for approach in ("position", "torque_multihead")]  # fmt: skip
+TRAINING = ["--perturbation=low", "--set=motors.delay.range=[0,2]", "--set=sensing.delay.range=[0,1]"]
+"""Random parameters, pushes, and latencies in physics steps of 5 ms: what a robot has."""
+SIZES = ["--set=actor.hidden_dims=[256,128]"]  # a quarter of a megabyte
+MOTORS = {"anymal_c": "ideal"}  # others have real ones
+EVALUATION = ["--num_envs=1000", "--steps=2000", "--seed=1"]
+PERTURBATIONS = ("low", "none")
+CROSSING = ["--num_envs=40", "--seed=1", "--terrain", "all"]
+
+
+def main() -> None:
+    """Train and pack each."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=NAMES, help="robot/approach; default: all")
+    parser.add_argument("--log_root", type=Path, default=Path("logs"), help="folder of the runs; default: ./logs")
+    parser.add_argument("--seed", type=int, default=1, help="of the trainings; default: 1")
+    args = parser.parse_args()
+    for name in args.names:
+        if name not in NAMES:
+            raise unknown_name("policy", name, NAMES)
+    for name in args.names:
+        task, motors = name.replace("/", "_"), MOTORS.get(name.split("/")[0], "real")
+        settings = [*TRAINING, *SIZES, f"--motors={motors}"]
+        run("train", f"--task={task}", f"--log_root={args.log_root}", f"--seed={args.seed}", *settings)
+        pack(find_run(args.log_root / task, None), name)
+
+
+def pack(trained: Path, name: str) -> None:
+    """Write the folder of a policy from the run that trained it."""
+    folder, config = POLICIES_DIR / name, load_config(trained)
+    shutil.rmtree(folder, ignore_errors=True)
+    file = find_checkpoint(trained, None)
+    content = checkpoint.read(file, "checkpoint", "cpu")
+    checkpoint.write(folder / file.name, {key: content[key] for key in ("actor_state_dict", "iter", "infos")})
+    shutil.copy(trained / CONFIG_FILE, folder)
+    how = ["--log_root=.", f"--load_run={folder}"]
+    run("export", *how, f"--out={folder / 'exported'}")
+    for part in ("policy.onnx", "policy.yaml"):
+        shutil.move(folder / "exported" / part, folder)
+    shutil.rmtree(folder / "exported")
+    measured = {kind: measure(folder, *EVALUATION, f"--perturbation={kind}")["metrics"] for kind in PERTURBATIONS}
+    tiles = measure(folder, *CROSSING)["grounds"] if "rough" in name else []
+    card = {
+        "policy": name,
+        "task": config["task"],
+        "steps": int(content["infos"]["total_timesteps"]),
+        "seed": config["train"]["seed"],
+        "trained": {key: config[key] for key in ("command", "versions")},
+        "machine": device_name(resolve_device(None)),
+        "evaluation": " ".join(EVALUATION),
+        "metrics": {kind: {key: estimate(value) for key, value in each.items()} for kind, each in measured.items()},
+        "crossed": {kind: {tile["level"]: estimate(tile["crossed"]) for tile in tiles if tile["kind"] == kind}
+                    for kind in sorted({tile["kind"] for tile in tiles})},
+        "license": "BSD-3-Clause",
+        "files": {path.name: sha256(path) for path in sorted(folder.iterdir())},
+    }  # fmt: skip
+    write_whole(folder / CARD, yaml.dump(card, Dumper=Dumper, sort_keys=False, width=100))
+
+
+def measure(folder: Path, *words: str) -> dict:
+    """Return what evaluate.py measures of a packed policy."""
+    result = folder / "measured.json"
+    run("evaluate", "--log_root=.", f"--load_run={folder}", *words, f"--json={result}")
+    measured: dict = json.loads(result.read_text())
+    result.unlink()
+    return measured
+
+
+def estimate(value: dict[str, float]) -> list[float]:
+    """Return a mean and its standard error."""
+    return [round(value[key], 5) for key in ("mean", "standard_error")]
+
+
+def run(script: str, *words: str) -> None:
+    """Run a script."""
+    subprocess.run([sys.executable, SCRIPTS_DIR / f"{script}.py", *words], check=True)
+
+
+if __name__ == "__main__":
+    cli.run_script(main)
