@@ -11,12 +11,13 @@ from legged_torque.utils.policies import policy_dir, policy_names, read_card
 def main() -> None:
     """Print a line per policy."""
     cli.Parser(__doc__).parse_args()
-    print(f"{'policy':<24} {'task':<28} {'steps':>12}  {'tracking':<18} falls per minute")
+    print(f"{'policy':<32} {'steps':>12}  {'tracking':<15} {'with perturbations':<18} falls per minute with them")
     for name in policy_names():
         card = read_card(policy_dir(name))
-        measured = {metric: card["metrics"][metric] for metric in ("track_percentage", "falls_per_minute")}
-        texts = [f"{mean:.3f} +- {error:.3f}" for mean, error in measured.values()]
-        print(f"{name:<24} {card['task']:<28} {card['steps']:>12,}  {texts[0]:<18} {texts[1]}")
+        metrics = [card["metrics"][kind] for kind in ("none", "low")]
+        texts = ["{:.3f} +- {:.3f}".format(*each["track_percentage"]) for each in metrics]
+        falls = "{:.3f} +- {:.3f}".format(*metrics[1]["falls_per_minute"])
+        print(f"{name:<32} {card['steps']:>12,}  {texts[0]:<15} {texts[1]:<18} {falls}")
 
 
 if __name__ == "__main__":

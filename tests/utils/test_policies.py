@@ -13,22 +13,20 @@ from legged_torque.utils.policies import CARD, POLICIES_DIR, policy_dir, policy_
 
 NAMES = policy_names()
 APART = 4.0  # standard errors of a difference
+CHANCE = 0.1  # those of two robots may be small by chance
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_cards(name, tmp_path):
-    """A new evaluation, in other worlds, agrees with each; every file has its checksum."""
+    """What a card says of a GPU's many worlds, plain MuJoCo agrees with; every file has its checksum."""
     folder = policy_dir(name)
     card = read_card(folder)
     assert {*card["files"], CARD} == {path.name for path in folder.iterdir()} and card["policy"] == name
-    words = [f"--policy={name}", "--device=cpu", "--num_envs=16", "--steps=500", "--seed=7", "--json=measured.json"]
-    status, _, error = run_here("evaluate.py", *words, root=tmp_path)
+    status, _, error = run_here("sim2sim.py", name, "--steps=300", "--robots=2", "--json=measured.json", root=tmp_path)
     assert status == 0, error
-    measured = json.loads((tmp_path / "measured.json").read_text())["metrics"]
-    for metric in ("track_percentage", "track_xy", "height", "mechanical_power"):
-        mean, deviation = card["metrics"][metric]
-        here = measured[metric]
-        assert abs(here["mean"] - mean) <= APART * math.hypot(deviation, here["standard_error"]), metric
+    here = json.loads((tmp_path / "measured.json").read_text())["metrics"]["track_percentage"]
+    mean, deviation = card["metrics"]["none"]["track_percentage"]
+    assert abs(here["mean"] - mean) <= APART * math.hypot(deviation, here["standard_error"]) + CHANCE
 
 
 def test_scripts(tmp_path):
