@@ -2,9 +2,9 @@
 
 Examples:
     python scripts/demo.py                    # a Go2 on rough ground
-    python scripts/demo.py go2/position       # another policy, see policies.py
+    python scripts/demo.py go2/position       # another policy, see policies.py; the page offers them, too
 
-It is play.py --policy ... --viewer web --terrain ..., with a ground that such policies cross.
+It is play.py --policy ... --viewer web, on kinds of rough ground that the policies for it cross.
 """
 
 import runpy
@@ -14,22 +14,23 @@ from typing import Annotated
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils import cli
 from legged_torque.utils.limits import Limits
-from legged_torque.utils.policies import policy_dir
 
-POLICY = "go2/torque_multihead"
-GROUND = ["--terrain", "rough_slope", "waves", "--level", "0.2", "0.3"]
+POLICY = "go2/rough_torque_multihead"
+KINDS = ["stairs_up", "stairs_down", "rough_slope", "discrete_obstacles", "waves"]
+ROUGH = ["--terrain", *KINDS, "--level", "0.3", "0.6"]
 
 
 def main() -> None:
     """Call play.py."""
     parser = cli.Parser(__doc__)
     parser.add_argument("policy", nargs="?", default=POLICY, help="robot/approach; default: %(default)s")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s")
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
     args = parser.parse_args()
     cli.check_args(args, port=Annotated[int, Limits(1, 65535)])
-    policy_dir(args.policy)  # or its error
-    words = [f"--policy={args.policy}", "--viewer=web", "--num_envs=1", f"--port={args.port}", *GROUND]
-    sys.argv[1:] = [*words, "--command", "0.5", "0", "0"]
+    ground = ROUGH if "rough" in args.policy else []
+    words = [f"--policy={args.policy}", "--viewer=web", "--num_envs=1", f"--host={args.host}", f"--port={args.port}"]
+    sys.argv[1:] = [*words, *ground, "--command", "0.5", "0", "0"]
     runpy.run_path(str(SCRIPTS_DIR / "play.py"), run_name="__main__")
 
 

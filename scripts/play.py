@@ -13,12 +13,14 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import os
 import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils import cli
@@ -146,6 +148,9 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
     if args.command:
         session.set_command(tuple(args.command))
     watch(session)
+    if session.chosen:
+        demo = [str(SCRIPTS_DIR / "demo.py"), session.chosen, f"--host={args.host}", f"--port={args.port}"]
+        os.execv(sys.executable, [sys.executable, *demo])
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:

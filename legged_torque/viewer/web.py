@@ -17,6 +17,7 @@ from viser._messages import RunJavascriptMessage
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
+from legged_torque.utils.policies import policy_names
 from legged_torque.viewer.access import GuardedServer
 from legged_torque.viewer.drawing import Drawing, Ground
 from legged_torque.viewer.plots import WIDTH, Plots
@@ -159,6 +160,10 @@ class Page:
         gui, session = self._gui, self._session
         with gui.add_folder("Command"):
             self._add_command()
+        if session.policy:
+            hint = "another robot or another way to control it; comes in some seconds"
+            policy = gui.add_dropdown("policy", policy_names(), hint=hint)
+            self._bind(policy, lambda: session.chosen or session.policy, session.stop)
         with gui.add_folder("Time"):
             pause = gui.add_checkbox("pause", False, hint="stop all robots; controls take effect at once")
             self._bind(pause, lambda: session.is_paused, session.set_paused)
@@ -361,4 +366,5 @@ def watch(session: Session, title: str, host: str, port: int, again: str, no_ren
         with StopRequest(lambda text: session.stop()):
             session.run()
     finally:
-        page.close(f"If a training has started it, that has ended, too. Open the viewer again with: {again}")
+        ended = f"If a training has started it, that has ended, too. Open the viewer again with: {again}"
+        page.close(f"{session.chosen} comes in some seconds." if session.chosen else ended)

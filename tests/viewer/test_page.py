@@ -19,6 +19,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRo
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
+from legged_torque.utils.policies import POLICIES_DIR, name_of, policy_names
 from legged_torque.viewer import scene
 from legged_torque.viewer.plots import gait_html, joints_by_leg
 from legged_torque.viewer.video import VideoRecorder
@@ -108,6 +109,19 @@ def test_error_of_a_part(page, monkeypatch, capsys, owner, name):
         wait_for(lambda: not page.errors.visible)
     assert moves(page)
     assert capsys.readouterr().err.count("Traceback") == 1  # not with every picture
+
+
+def test_choice_of_a_policy(page):
+    """A bundled policy's page offers all of them; a choice ends the session and is handed on."""
+    session, chosen = page.session, []
+    session.policy, session.stop = name_of(POLICIES_DIR / "go2" / "position"), chosen.append
+    with contextlib.closing(Page(session, "title", "127.0.0.1", 8460)) as other, visitor(other.server) as send:
+        dropdown = control(other, "policy")
+        assert list(dropdown.options) == policy_names()
+        wait_for(lambda: dropdown.value == "go2/position")
+        send(type="GuiUpdateMessage", uuid=dropdown._impl.uuid, updates={"value": "g1/position"})
+        wait_for(lambda: chosen == ["g1/position"])
+    del session.stop
 
 
 def test_recording(page, monkeypatch):

@@ -68,9 +68,12 @@ class G1Cfg(LeggedRobotCfg):
     class rewards:
         base_height_target = 0.785
         feet_air_time_target = 0.4
+        tracking_temperature = 10.0
         held_joints = ["hip_roll", "hip_yaw"]
 
         class scales:
+            tracking_lin_vel = 2.0
+            tracking_ang_vel = 2.0
             orientation = -2.0
             dof_pos_limits = -5.0
             dof_acc = -1e-7
@@ -78,8 +81,7 @@ class G1Cfg(LeggedRobotCfg):
             action_rate = -0.01
             collision = 0.0
             base_height = -10.0
-            feet_air_time = 0.0
-            single_stance = 1.0
+            feet_air_time = 1.0
             dof_deviation = -0.2
             alive = 0.2
 
@@ -92,7 +94,10 @@ class G1Cfg(LeggedRobotCfg):
 
 
 class G1CfgPPO(LeggedRobotCfgPPO):
-    """Training of a G1, which is the same left and right."""
+    """Training of a G1, which is the same left and right and learns for longer than four legs."""
+
+    class runner:
+        total_steps = 220_000_000
 
     class algorithm:
         class symmetry_cfg:
