@@ -16,7 +16,7 @@ from legged_torque.utils.config import to_dict
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")]
+OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "AGENTS.md", "SECURITY.md")]
 PAGES = [*OTHERS, *sorted(DOCS.rglob("*.md"))]
 
 
