@@ -18,7 +18,7 @@ setup(
         "legged_torque.deploy": ["policy.schema.json"],
         "legged_torque.importer": ["scene.xml"],
         "legged_torque.utils": ["successors.yaml"],
-        "legged_torque.viewer": ["page.js"],
+        "legged_torque.viewer": ["page.js", "static/*"],
         "legged_torque.resources": ["policies/**", "robots/**"],
         "legged_torque.descriptions": ["*.yaml"],
         "legged_torque.paper.report": ["*.jinja"],

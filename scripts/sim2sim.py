@@ -68,14 +68,11 @@ def main() -> None:
     no_renderer = None if args.viewer else choose_offscreen_renderer()
     cli.options_of(args)  # imports files of tasks, which may add numpy functions of their terms
     with cli.slow_imports():
-        import numpy as np
-
         from legged_torque.deploy.ground import select_ground
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
-        from legged_torque.deploy.simulation import Simulation
-        from legged_torque.utils.display import Counter
-        from legged_torque.utils.metrics import UNITS, estimates, ratios
+        from legged_torque.deploy.simulation import Simulation, evaluate
+        from legged_torque.utils.metrics import UNITS
         from legged_torque.utils.mjcf import set_joints
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
@@ -96,19 +93,19 @@ def main() -> None:
     simulation = Simulation(policy, robot, args.command, args.push_velocity, args.push_probability)
     notes = robot.notes + simulation.notes
     recorder = SimulationRecorder(simulation) if args.video else None
-    sums = []
     with simulation_window(simulation) if args.viewer else contextlib.nullcontext(lambda: None) as show:
         training = policy.description["training"]
         what = f"{policy.description['task']}, {training['checkpoint']} of {training['run']}"
         for line in (f"{what}, in MuJoCo with '{xml}':", *(f"  note: {note}" for note in notes)):
             print(printable(line))
-        with Counter("simulating, step", args.robots * args.steps) as counter:
-            for number in range(args.robots):
-                record = recorder.add_step if recorder and number == 0 else lambda: None
-                after = (record, show, counter.add)
-                sums.append(simulation.run(args.steps, [args.seed, number], lambda after=after: [do() for do in after]))
+
+        def on_step(number: int) -> None:
+            show()
+            if recorder and number == 0:
+                recorder.add_step()
+
+        metrics = evaluate(simulation, args.robots, args.steps, args.seed, on_step)
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
-    metrics = estimates(ratios(np.array(sums).T, robot.weight, control_step, simulation.has_losses))
     print(f"  {counted(args.robots, 'robot')} x {counted(args.steps, 'step')} of {control_step:g} s")
     for name, value in metrics.items():
         print(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}")

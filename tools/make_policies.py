@@ -63,9 +63,7 @@ def pack(trained: Path, name: str) -> None:
     """Write the folder of a policy from the run that trained it."""
     folder, config = POLICIES_DIR / name, load_config(trained)
     shutil.rmtree(folder, ignore_errors=True)
-    file = find_checkpoint(trained, None)
-    content = checkpoint.read(file, "checkpoint", "cpu")
-    checkpoint.write(folder / file.name, {key: content[key] for key in ("actor_state_dict", "iter", "infos")})
+    content = checkpoint.write_actor(find_checkpoint(trained, None), folder)
     shutil.copy(trained / CONFIG_FILE, folder)
     how = ["--log_root=.", f"--load_run={folder}"]
     run("export", *how, f"--out={folder / 'exported'}")

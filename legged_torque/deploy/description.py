@@ -12,7 +12,7 @@ import yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
-from legged_torque.utils.policies import policy_dir, policy_names
+from legged_torque.utils.policies import HUB, policy_dir, policy_names
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
@@ -29,7 +29,7 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """
     path = Path(path)
     if not path.exists():
-        if path.as_posix() not in policy_names():
+        if not path.as_posix().startswith(HUB) and path.as_posix() not in policy_names():
             names = ", ".join(policy_names())
             raise UserError(f"there is no file or folder '{path}', nor a bundled policy of that name: {names}")
         path = policy_dir(path.as_posix())

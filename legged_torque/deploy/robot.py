@@ -35,6 +35,7 @@ class MujocoRobot:
 
     Attributes:
         file: The MJCF.
+        spec: The MJCF as it was compiled, with the ground.
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
         notes: Differences from the training, a line each.
@@ -72,6 +73,7 @@ class MujocoRobot:
                 self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
             if collided and not pairs:
                 self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
+        self.spec = spec
         self.data = mujoco.MjData(self.model)
         old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
         if not np.isclose(old, step, rtol=1e-6):
@@ -93,6 +95,15 @@ class MujocoRobot:
             self.notes.append(f"{others} motors of the MJCF are not driven by the policy and get 0")
         self._find_geoms(description["episode"]["ends_on_contact_of"], collided)
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
+
+    def addresses(self) -> dict[str, list[Any]]:
+        """Return indices into MuJoCo's arrays of the policy's joints and motors, and of geoms that end episodes.
+
+        Angles about the policy's axes are ``signs`` times MuJoCo's, and ``ctrl`` is a torque by ``torque_per_control``.
+        """
+        found = {"qpos": self._qpos, "dofs": self._dofs, "motors": self._motors, "signs": self._signs}
+        found |= {"torque_per_control": self._torque_per_control, "ending_geoms": np.flatnonzero(self._is_ending)}
+        return {name: values.tolist() for name, values in found.items()}
 
     # ---- sensors and motors ------------------------------------------------------------------------------------------
 

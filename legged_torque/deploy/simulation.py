@@ -13,9 +13,10 @@ from legged_torque.deploy.latency import Latency
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import MotorTwin
+from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.heading import heading
-from legged_torque.utils.metrics import NUM_SUMS, step_sums
+from legged_torque.utils.metrics import NUM_SUMS, Estimate, estimates, ratios, step_sums
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity, as in training; the others set one
 
@@ -191,6 +192,31 @@ class Simulation:
             x_ahead, y_ahead, _ = heading(self.robot.quat)
             left = (self._heading - math.atan2(y_ahead, x_ahead) + math.pi) % (2.0 * math.pi) - math.pi
             self.command[2] = np.clip(self._commands.get("heading_gain", 0.0) * left, *self._command_range[:, 2])
+
+
+def evaluate(
+    simulation: Simulation, robots: int, steps: int, seed: int, on_step: Callable[[int], None] = lambda robot: None
+) -> dict[str, Estimate]:
+    """Return the metrics of robots that walk one after the other, and count their steps on the terminal.
+
+    Args:
+        simulation: Of the policy; robot i draws with the seed [``seed``, i].
+        robots: How many.
+        steps: Control steps of each.
+        seed: Of all random numbers.
+        on_step: Called after every control step with the robot's number.
+    """
+    sums = []
+    with Counter("simulating, step", robots * steps) as counter:
+        for number in range(robots):
+
+            def after_step(number: int = number) -> None:
+                on_step(number)
+                counter.add()
+
+            sums.append(simulation.run(steps, [seed, number], after_step))
+    control_step = 1.0 / simulation.policy.description["timing"]["control_frequency"]
+    return estimates(ratios(np.array(sums).T, simulation.robot.weight, control_step, simulation.has_losses))
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> np.ndarray:

@@ -52,6 +52,14 @@ def read(file: Path, what: str, device: str) -> Any:
     return content
 
 
+def write_actor(file: Path, folder: Path) -> dict[str, Any]:
+    """Write what playing needs of a checkpoint to another folder, and return it: the actor and counters."""
+    content = read(file, "checkpoint", "cpu")
+    kept = {key: content[key] for key in ("actor_state_dict", "iter", "infos")}
+    write(folder / file.name, kept)
+    return kept
+
+
 def check_counters(state: dict[str, Any], file: str) -> None:
     """Raise a UserError if the counters of a checkpoint are not numbers."""
     try:

@@ -35,7 +35,7 @@ class MotorTwin:
         for link, described in links.items():
             if without_function(described):
                 raise UserError(f"no numpy function for the motor '{link}'")
-            motor = SimpleNamespace(**robot, **_constants(described, names, f"motors.{link}", robot["dt"]))
+            motor = SimpleNamespace(**robot, **constants(described, names, f"motors.{link}", robot["dt"]))
             self._links.append((FORMULAS[described["model"]], motor))
         check_encoders("motors", [link for link, described in links.items() if described["model"] == "encoder"])
         self._shape = (len(names),)
@@ -85,7 +85,7 @@ def without_function(described: dict[str, Any]) -> bool:
     return str(described.get("model")) not in FORMULAS
 
 
-def _constants(described: dict[str, Any], names: list[str], path: str, dt: float) -> dict[str, Any]:
+def constants(described: dict[str, Any], names: list[str], path: str, dt: float) -> dict[str, Any]:
     """Return constants by name; a UserError names those that do not exist or make no sense. Shapes: (joints,)."""
     cfg = MODELS[described["model"]]()
     update_from_dict(cfg, {name: value for name, value in described.items() if name != "model"}, path)

@@ -5,33 +5,20 @@ for all tests, and sessions are paused, except where something must move: then n
 """
 
 import contextlib
-import ctypes.util
-import importlib.util
 import io
 import os
 import re
-import shutil
 import signal
 import subprocess
 
+import imageio
 import numpy as np
 import pytest
-
-CHROMIUM, DRIVER = (shutil.which("chromium") or shutil.which("google-chrome")), shutil.which("chromedriver")
-PARTS = {name: importlib.util.find_spec(name) for name in ("viser", "selenium", "imageio_ffmpeg")}
-PARTS |= {"chromium": CHROMIUM, "chromedriver": DRIVER, "libosmesa6": ctypes.util.find_library("OSMesa")}
-MISSING = [name for name, part in PARTS.items() if not part]
-if not os.environ.get("NEEDS_BROWSER"):
-    pytest.skip("takes two minutes in Chromium: set NEEDS_BROWSER=1, as .ci/run does", allow_module_level=True)
-if MISSING:
-    pytest.fail(f"not installed: {', '.join(MISSING)}")
-
-import imageio
 from PIL import Image
-from selenium import webdriver
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
+from support.browser import complaints, screen
 from support.clock import wait_for as wait
 from support.quick_kernels import COMMAND, PATHS
 from support.scripts import run_here
@@ -45,11 +32,6 @@ from legged_torque.viewer.web import Page
 
 pytestmark = pytest.mark.timeout(900)  # [s]
 TIMEOUT = 150.0  # seconds that the page may take for something; a picture takes 10 on a busy machine
-OPTIONS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--window-size=900,600 --force-device-scale-factor=0.5"  # of four pixels one is drawn
-)
 
 
 def wait_for(condition):
@@ -90,21 +72,6 @@ def page(session):
         yield served
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """A browser without a window, with a profile of its own, that notes what pages complain of."""
-    folder, options = tmp_path_factory.mktemp("browser"), webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for option in (*OPTIONS.split(), f"--user-data-dir={folder / 'profile'}"):
-        options.add_argument(option)
-    options.add_experimental_option("prefs", {"download.default_directory": str(folder)})
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    driver.downloads = folder
-    yield driver
-    driver.quit()
-
-
 def text_of(browser):
     """What can be read on the page."""
     return browser.find_element(By.TAG_NAME, "body").text
@@ -113,22 +80,6 @@ def text_of(browser):
 def simulated_time(browser):
     """How long the robots have walked [s]."""
     return float(re.search(r"([\d.]+) s simulated", text_of(browser))[1])
-
-
-def complaints(browser):
-    """Errors that were logged since the last call."""
-    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
-
-
-@contextlib.contextmanager
-def screen(browser, width, height, factor, mobile=False):
-    """Context of another screen, with a number of pixels per unit of length."""
-    size = {"width": width, "height": height, "deviceScaleFactor": factor, "mobile": mobile}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    try:
-        yield
-    finally:
-        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
 def open_page(browser, url):

@@ -1,0 +1,143 @@
+"""Pack an exported policy for others: a page that runs it in the browser, a video and a card.
+
+The folder is a model of the Hugging Face Hub, to which --push uploads it; play.py and others take it as
+--policy hf:owner/name. The page also works from any server of files.
+
+Examples:
+    python scripts/publish.py go2/torque_multihead    # then: python -m http.server -d published
+    python scripts/publish.py logs/a1_torque_multihead/RUN/exported_1119 --out published --push owner/name
+"""
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from legged_torque import resource_path
+from legged_torque.deploy.description import DESCRIPTION_FILE, NETWORK_FILE, read
+from legged_torque.utils import cli
+from legged_torque.utils.devices import choose_offscreen_renderer
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import part_of, write_errors, write_whole
+from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.policies import CARD, read_card, sha256, upload
+from legged_torque.utils.runs import CONFIG_FILE, load_config
+
+ROBOTS, STEPS, SHOWN_STEPS = 16, 500, 250
+VIDEO = "replay.mp4"  # the name that Hugging Face shows
+README = """\
+---
+library_name: legged_torque
+pipeline_tag: reinforcement-learning
+tags: [robotics, locomotion, torque-control, mujoco]
+{license_line}---
+# {policy}
+
+A policy of legged_torque's task `{task}` after {steps:,} steps of training. `policy.yaml` says how to run
+`policy.onnx`; `index.html` does so in the browser, on a plane, from any server of files: `python -m http.server`.
+
+| {names} |
+|{lines}|
+{rows}
+
+Means and standard errors over worlds. `card.yaml` has all of them, and how they were measured.
+"""
+SHOWN = {
+    "track_percentage": "tracking",
+    "falls_per_minute": "falls per minute",
+    "cost_of_transport": "cost of transport",
+}
+
+
+def parse_args() -> argparse.Namespace:
+    """Parse and check the command line."""
+    parser = cli.Parser(__doc__)
+    parser.add_argument("policy", type=Path, help="folder of policy.yaml and policy.onnx, or a bundled policy")
+    parser.add_argument("--out", type=Path, default=Path("published"), help="new folder; default: %(default)s")
+    parser.add_argument("--push", metavar="OWNER/NAME", help="also upload it to this model of the Hugging Face Hub")
+    args = parser.parse_args()
+    if args.out.exists():
+        raise UserError(f"'{args.out}' exists: --out must be a new folder")
+    cli.check_output(args.out / CARD)
+    return args
+
+
+def main() -> None:
+    """Write the folder, and upload it if asked to."""
+    args = parse_args()
+    no_renderer = choose_offscreen_renderer()
+    with cli.slow_imports():
+        from legged_torque.deploy.policy import Policy
+        from legged_torque.deploy.robot import MujocoRobot
+        from legged_torque.deploy.simulation import Simulation, evaluate
+        from legged_torque.viewer.static_page import check, write_page
+        from legged_torque.viewer.video import SimulationRecorder
+    _, network = read(args.policy)
+    policy = Policy(args.policy)
+    check(policy)
+    robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
+    simulation = Simulation(policy, robot)
+    recorder, part = SimulationRecorder(simulation), part_of(args.out)
+
+    def on_step(number: int) -> None:
+        if number == 0 and len(recorder.steps) < SHOWN_STEPS:
+            recorder.add_step()
+
+    with write_errors(args.out):
+        part.mkdir(parents=True)
+        try:
+            card = copy_policy(network, part, policy.description)
+            metrics = evaluate(simulation, 1 if "metrics" in card else ROBOTS, STEPS, 1, on_step)
+            numbers = {name: [round(value.mean, 5), round(value.standard_error, 5)] for name, value in metrics.items()}
+            card.setdefault("metrics", {"plain MuJoCo": numbers})
+            for note in write_page(part, policy, card["policy"]):
+                print(f"  note: {note}")
+            write_cards(part, card)
+            part.rename(args.out)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    recorder.save(args.out / VIDEO, no_renderer)
+    print(f"Look at it: python -m http.server -d {args.out}")
+    if args.push:
+        print(f"Uploaded to {upload(args.out, args.push)}")
+
+
+def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
+    """Copy an export, and the settings and the actor of the run that it is in; return the card, or how it begins."""
+    export, run, training = network.parent, network.parents[1], description["training"]
+    shutil.copy(network, folder / NETWORK_FILE)
+    if (export / DESCRIPTION_FILE).is_file():  # the network holds it, too
+        shutil.copy(export / DESCRIPTION_FILE, folder)
+    if (export / CARD).is_file():
+        for name in (CONFIG_FILE, training["checkpoint"]):
+            shutil.copy(export / name, folder)
+        return read_card(export)
+    card = {"policy": f"{training['run']}, {description['task']}", "task": description["task"]}
+    card |= {"steps": training["total_steps"], "versions": description["versions"]}
+    card["evaluation"] = f"{ROBOTS} robots x {STEPS} steps in plain MuJoCo"
+    if (run / CONFIG_FILE).is_file() and (run / training["checkpoint"]).is_file():
+        from legged_torque.learning import checkpoint
+
+        shutil.copy(run / CONFIG_FILE, folder)
+        checkpoint.write_actor(run / training["checkpoint"], folder)
+        card["trained"] = load_config(run).get("command", "")
+    return card
+
+
+def write_cards(folder: Path, card: dict[str, Any]) -> None:
+    """Write the card with the files' checksums, and README.md, which the Hub shows."""
+    kinds = card["metrics"].items()
+    names = " | ".join(["perturbations", *SHOWN.values()])
+    rows = [" | ".join([kind, *("{:.3f} +- {:.3f}".format(*each[name]) for name in SHOWN)]) for kind, each in kinds]
+    table = {"names": names, "lines": "---|" * len(SHOWN) + "---", "rows": "\n".join(f"| {row} |" for row in rows)}
+    table["license_line"] = f"license: {card['license'].lower()}\n" if "license" in card else ""
+    write_whole(folder / "README.md", README.format(**card, **table))
+    described = (NETWORK_FILE, DESCRIPTION_FILE, CONFIG_FILE, *(file.name for file in folder.glob("model_*.pt")))
+    card["files"] = {name: sha256(folder / name) for name in sorted(described) if (folder / name).is_file()}
+    write_whole(folder / CARD, yaml.dump(card, Dumper=Dumper, sort_keys=False, width=100))
+
+
+if __name__ == "__main__":
+    cli.run_script(main, draws=True)

@@ -1,0 +1,87 @@
+"""Policies that others publish: up to a stand-in for the Hugging Face Hub, and down from there."""
+
+import functools
+
+import pytest
+import yaml
+from huggingface_hub import constants
+from support import hub
+from support.scripts import assert_told_in_one_line, run_here
+
+from legged_torque.envs import task_registry
+from legged_torque.utils import devices
+from legged_torque.utils.options import Options
+from legged_torque.utils.policies import policy_dir
+
+FILES = {
+    "README.md",
+    "card.yaml",
+    "config.yaml",
+    "index.html",
+    "model_1119.pt",
+    "page.json",
+    "policy.onnx",
+    "policy.yaml",
+}
+
+
+@pytest.fixture(scope="module")
+def server():
+    """The stand-in."""
+    with hub.running() as running:
+        yield running
+
+
+@pytest.fixture
+def script(server, tmp_path, monkeypatch):
+    """Runs a script that takes the stand-in for the Hub."""
+    files = f"{server.address}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+    patched = {
+        "ENDPOINT": server.address,
+        "HUGGINGFACE_CO_URL_TEMPLATE": files,
+        "HF_HUB_CACHE": str(tmp_path / "cache"),
+    }
+    for name, value in patched.items():
+        monkeypatch.setattr(constants, name, value)
+    monkeypatch.setenv("HF_TOKEN", "hf_none")
+    monkeypatch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
+    (tmp_path / "here").mkdir()
+    return functools.partial(run_here, root=tmp_path / "here")
+
+
+def test_up_and_down(script, server):
+    """What was published is played, and a file that is not the one of the card is refused."""
+    status, output, errors = script("publish.py", "a1/position", "--push", "me/a1")
+    assert status == 0 and f"Uploaded to {server.address}/me/a1" in output, errors
+    model = server.models["me/a1"]
+    assert {*model} >= FILES
+    front = yaml.safe_load(model["README.md"].decode().split("---")[1])
+    assert front["library_name"] == "legged_torque" and "tracking" in model["README.md"].decode()
+    assert model["policy.onnx"] == (policy_dir("a1/position") / "policy.onnx").read_bytes()
+    few = ["--robots=1", "--steps=2"]
+    assert script("sim2sim.py", "hf:me/a1", *few)[0] == 0
+    assert task_registry.load_run(Options(task=None, policy="hf:me/a1")).checkpoint.name == "model_1119.pt"
+    server.models["me/other"] = model | {"policy.onnx": model["policy.onnx"] + b" "}
+    status, _, errors = script("sim2sim.py", "hf:me/other", *few)
+    assert status == 2 and errors.endswith("policy.onnx' is not the file that card.yaml describes\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["sim2sim.py", "hf:me/none"], "cannot download the policy 'hf:me/none': 404"),
+        (["sim2sim.py", "hf:none"], "cannot download the policy 'hf:none': "),
+        (["publish.py", "a1/positoin"], "a1/position"),
+        (["publish.py", "a1/position", "--out=."], "'.' exists"),
+    ],
+)
+def test_mistakes(script, tmp_path, words, expected):
+    """One line, status 2, and nothing written."""
+    assert_told_in_one_line(script(*words), expected)
+    assert not [*(tmp_path / "here").iterdir()]
+
+
+def test_no_network(script, monkeypatch):
+    """Neither the Hub nor a copy of the policy is there."""
+    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
+    assert_told_in_one_line(script("sim2sim.py", "hf:me/first"), "cannot download the policy 'hf:me/first': ")
