@@ -60,17 +60,22 @@ def main() -> None:
         import torch
 
         from legged_torque.envs.base.evaluation import evaluation_cfg
+        from legged_torque.envs.base.sweep import draw_only
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:
         env_cfg = evaluation_cfg(run.env_cfg, run.env_cfg.env.num_envs)
         if args.command:
             env_cfg.commands.fix(args.command)
+        if args.sweep:
+            draw_only(env_cfg, args.sweep)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
     if args.all_checkpoints:
         measured = measure_all(args, run, env, runner)
+    elif args.sweep:
+        measured = sweep(args, run, env, runner)
     elif grounds:
         measured = cross_tiles(run, env, runner, grounds)
     else:
@@ -99,10 +104,14 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
     parser.add_argument("--level", nargs="+", type=float, help=hint)
+    hint = "random parameter, whose range is split: prints metrics of each part, see docs/randomization.md"
+    parser.add_argument("--sweep", metavar="NAME", help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
         raise UserError("--all_checkpoints takes neither --terrain nor --checkpoint")
+    if args.sweep and (args.terrain or args.all_checkpoints):
+        raise UserError("--sweep takes neither --terrain nor --all_checkpoints")
     if args.terrain and args.steps is not None:
         raise UserError("--steps is not for --terrain: how long robots may try follows from the command")
     if args.level and not args.terrain:
@@ -155,6 +164,20 @@ def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runn
     settings["seed"] = args.seed
     result = {"seed": run.config["train"]["seed"], "trained_with": run.config["train"], "evaluation": settings}
     return result | {"trained_env": run.config["env"], "points": points}
+
+
+def sweep(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
+    """Roll a policy out, print its metrics for each part of a parameter's range, and return them."""
+    from legged_torque.envs.base.metrics import measure
+    from legged_torque.envs.base.sweep import PUSH, PushSweep, Sweep
+
+    parts = PushSweep(env) if args.sweep == PUSH else Sweep(env, args.sweep)
+    measure(env, runner.get_inference_policy(env.device), args.steps, parts.add_step)
+    size = f"{counted(env.num_envs, 'world')} x {counted(args.steps, 'step')}"
+    print(f"{run.checkpoint}, after {counted(runner.logger.tot_timesteps, 'step')} of training, {size}:")
+    for line in parts.lines():
+        print(line)
+    return {"num_steps": args.steps, "sweep": {"parameter": parts.name, "unit": parts.unit, "parts": parts.table()}}
 
 
 def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, grounds: Grounds) -> dict[str, Any]:

@@ -112,6 +112,13 @@ class Randomization:
         self.seeds = torch.zeros(num_envs, dtype=torch.int32, device=device)
         self._rows: wp.array = wp.array(rows, dtype=kernels.RandomNumber, device=device)
 
+    def range_of(self, name: str) -> tuple[int, float, float]:
+        """Return the column of a parameter's first number in :attr:`values`, and the ends of that number's range."""
+        place = sum(list(self.sizes.values())[: list(self.sizes).index(name)])
+        (row,) = (row for row in self._rows.numpy() if row["place"] == place)
+        half = 1.0 / row["per_half_range"] if row["per_half_range"] else 0.0
+        return place, float(row["middle"] - half), float(row["middle"] + half)
+
     def own_fields(self) -> dict[str, Tensor]:
         """Return the tensors that are no fields of the model, by name of their parameter."""
         names = [parameter.name for parameter in self.parameters if isinstance(parameter.field, Tensor)]

@@ -1,0 +1,126 @@
+"""Metrics by the value of a random parameter, against sums by hand; pushes that fell a robot, and those that do not."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from support.scripts import SMALL, assert_told_in_one_line, run_here
+
+from legged_torque.envs.base.metrics import measure
+from legged_torque.envs.base.sweep import NUM_PARTS, PUSH, REST, WATCHED, PushSweep, Sweep, draw_only
+from legged_torque.utils.errors import UserError
+
+QUICK = {"domain_rand.resampling_probability": 0.2, "env.episode_length_s": 0.3, "commands.resampling_probability": 0.0}
+
+
+def swept(make_task, name, **settings):
+    """Worlds that draw one parameter often."""
+    from legged_torque.envs import task_registry
+
+    cfg = task_registry.get_cfgs("a1_position")[0]
+    draw_only(cfg, name)
+    rand = {f"domain_rand.{key}": getattr(cfg.domain_rand, key) for key in ("randomize_parameters", "keep_fixed")}
+    return make_task("a1_position", 12, **QUICK, **rand, **settings)
+
+
+def shaking(task):
+    """A policy that acts at random."""
+    rng = torch.Generator().manual_seed(3)
+    return lambda obs: 2.0 * torch.randn(task.num_envs, task.num_actions, generator=rng)
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "ends", "tensor"),
+    [
+        ("motor_strength", {"domain_rand.motor_strength": {"scale": [0.5, 1.5]}}, (0.5, 1.5), "strength"),
+        ("contact_stiffness", {"domain_rand.contact_stiffness": {"set": [500.0, 2500.0]}}, (500.0, 2500.0), "solref"),
+        ("action_delay", {"motors.delay.range": [0, 3]}, (0, 4), "delay"),
+    ],
+)
+def test_parts(make_task, name, setting, ends, tensor):
+    """Mean speed and number of steps of each part are those of the steps in which worlds had such values."""
+    task = swept(make_task, name, **setting)
+    values = {
+        "strength": lambda: task.motors.strength[:, 0],
+        "solref": lambda: -task.sim.field("geom_solref", [0])[:, 0, 0],
+        "delay": lambda: task.motors.links["delay"].queue.drawn[:, 0].floor(),
+    }[tensor]
+    parts, seen, before = Sweep(task, name), [], []
+    policy = shaking(task)
+
+    def noted(obs):
+        before.append(values().numpy().copy())
+        return policy(obs)
+
+    def on_step(commands):
+        parts.add_step(commands)
+        velocity = task.state.planar_velocity()[:, :2].norm(dim=1).numpy()
+        seen.append((velocity.copy(), task.reset_buf.numpy().copy()))
+
+    measure(task, noted, 40, on_step)
+    drawn, speed, ended = np.array(before), np.array([each[0] for each in seen]), np.array([each[1] for each in seen])
+    drawn, speed, ended = drawn[1:], speed[1:], ended[1:]  # the first step is not counted
+    edges = np.linspace(*ends, (4 if name == "action_delay" else NUM_PARTS) + 1)
+    assert parts.edges == pytest.approx(edges.tolist())
+    assert len(np.unique(drawn)) >= 4 and ended.any()
+    member = np.digitize(drawn, edges[1:-1]) if name == "action_delay" else np.digitize(drawn, edges) - 1
+    for i, part in enumerate(parts.table()):
+        counted = (member == i) & ~ended
+        expected = speed[counted].mean() if counted.any() else math.nan
+        assert part["metrics"]["speed"]["mean"] == pytest.approx(expected, rel=1e-4, nan_ok=True)
+
+
+def test_pushes(make_task):
+    """Who lies down after a push has fallen; who was at rest has not; impulses are of the whole robot."""
+    task = make_task("a1_position", 64, **{f"domain_rand.{PUSH}": [-8.0, 8.0], "domain_rand.push_robots": False})
+    pushes, steps = PushSweep(task), round((REST + WATCHED) / task.dt)
+    speeds = []
+
+    def on_step(commands):
+        before = task.sim.qvel[:, :2].clone()
+        pushes.add_step(commands)
+        speeds.append((task.sim.qvel[:, :2] - before).norm(dim=1))
+
+    measure(task, lambda obs: torch.zeros(64, task.num_actions), 2 * steps, on_step)  # PD holds the nominal pose
+    pushed = torch.stack(speeds)
+    when = pushed.any(dim=1).nonzero()[:, 0].tolist()
+    assert when == [round(REST / task.dt), round(REST / task.dt) + steps]
+    table, mass = pushes.table(), task.sim.mj_model.body_mass.sum()
+    counts = np.histogram(pushed[when].numpy(), np.linspace(0.0, 8.0, NUM_PARTS + 1))[0]
+    assert [part["pushes"] for part in table] == counts.tolist() and counts.sum() == 128
+    assert table[1]["impulse"] == pytest.approx([1.0 * mass, 2.0 * mass], rel=1e-5)
+    assert table[0]["fell"]["mean"] == 0.0 and table[-1]["fell"]["mean"] > 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "message"),
+    [
+        (
+            "motor_strength",
+            {"domain_rand.motor_strength": {}},
+            "motor_strength is always 1: give domain_rand.",
+        ),
+        ("action_delay", {}, "action_delay is always 0: give motors.delay.range"),
+        ("foot_pos", {}, "foot_pos has 12"),
+    ],
+)
+def test_what_cannot_be_split(make_task, name, settings, message):
+    """One value, or numbers for each foot."""
+    task = swept(make_task, name, **settings)
+    with pytest.raises(UserError, match=message):
+        Sweep(task, name)
+
+
+def test_script(tmp_path):
+    """Mistakes are told in a line; a table is printed and written."""
+    assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
+    few = ["--num_envs=4", "--steps=3", "--device=cpu"]
+    for words, message in (
+        (["--sweep=trunk_mas"], "trunk_mass"),
+        (["--sweep=trunk_mass", "--all_checkpoints"], "--sweep takes neither"),
+        ([f"--sweep={PUSH}", f"--set=domain_rand.{PUSH}=[0,0]"], f"{PUSH} is always 0"),
+    ):
+        assert_told_in_one_line(run_here("evaluate.py", *few, *words, root=tmp_path), message)
+    status, output, errors = run_here("evaluate.py", *few, "--sweep=ground_friction", "--json=out.json", root=tmp_path)
+    assert status == 0 and "ground_friction []" in output, errors
