@@ -26,6 +26,7 @@ from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import path_inside, portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
+from legged_torque.utils.options import PUSH, draw_only
 from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
 
@@ -60,7 +61,6 @@ def main() -> None:
         import torch
 
         from legged_torque.envs.base.evaluation import evaluation_cfg
-        from legged_torque.envs.base.sweep import draw_only
     if grounds:
         env_cfg = grounds.cfg(run.env_cfg, run.env_cfg.env.num_envs)
     else:
@@ -104,7 +104,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
     hint = "difficulties of rough ground, 0 to 1; default: the ten of training, 0 to 0.9"
     parser.add_argument("--level", nargs="+", type=float, help=hint)
-    hint = "random parameter, whose range is split: prints metrics of each part, see docs/randomization.md"
+    hint = "random parameter, whose range is split: prints metrics of each part, see docs/results.md"
     parser.add_argument("--sweep", metavar="NAME", help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
@@ -169,7 +169,7 @@ def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runn
 def sweep(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
     """Roll a policy out, print its metrics for each part of a parameter's range, and return them."""
     from legged_torque.envs.base.metrics import measure
-    from legged_torque.envs.base.sweep import PUSH, PushSweep, Sweep
+    from legged_torque.envs.base.sweep import PushSweep, Sweep
 
     parts = PushSweep(env) if args.sweep == PUSH else Sweep(env, args.sweep)
     measure(env, runner.get_inference_policy(env.device), args.steps, parts.add_step)

@@ -4,6 +4,7 @@ Examples:
     python scripts/plot.py curves logs/a1_torque/*/evaluations.csv --out curves.png
     python scripts/plot.py pretraining report.json --out pretraining.png
     python scripts/plot.py randomization --out distributions.png
+    python scripts/plot.py sweeps sweeps/*.json --out sweeps.png
 
 Each figure has options of its own: plot.py curves --help.
 """
@@ -17,6 +18,7 @@ FIGURES = {
     "curves": "legged_torque.paper.plot:plot_curves",
     "pretraining": "legged_torque.paper.plot:plot_pretraining",
     "randomization": "legged_torque.paper.randomization_picture:plot_randomization",
+    "sweeps": "legged_torque.paper.sweep_picture:plot_sweeps",
 }
 """Functions ("module:name") by figure: each parses its own command line, ``sys.argv``, and draws."""
 

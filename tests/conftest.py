@@ -15,7 +15,6 @@ if not torch.cuda.is_available():
 with contextlib.suppress(ImportError):
     import triton  # noqa: F401  # before a script in this process loads OSMesa: after that it crashes
 
-import support.quick_kernels  # noqa: F401  # before a kernel is compiled
 from support.last_run import Recorder
 
 from legged_torque.envs import task_registry

@@ -14,7 +14,7 @@ from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, check_value, types_of
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import Options, draw_only
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
     checkpoint_number,
@@ -32,8 +32,8 @@ EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
 """Tiles that are crossed after training, and robots on each of them, by default."""
 TYPES = {"num_envs": Count, "num_steps": Count, "kinds": list[str], "levels": list[float]}
-ROUGH_GROUND = "rough ground"
-"""Name of the evaluation on :data:`GROUNDS`. Names of environments have no spaces."""
+ROUGH_GROUND, SWEEP = "rough ground", "sweep of "
+"""Name of the evaluation on :data:`GROUNDS`, and how those of sweeps begin. Names of environments have no spaces."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Cell:
     environment: str  # perturbation during training
     seed: int
     evaluated_in: tuple[str, ...]  # perturbations
-    crosses: bool = False  # whether the last checkpoint is evaluated on rough ground, too
+    further: tuple[str, ...] = ()  # other evaluations of the last checkpoint: ROUGH_GROUND, sweeps
 
     @property
     def name(self) -> str:
@@ -54,11 +54,13 @@ class Cell:
 
     @property
     def evaluations(self) -> list[str]:
-        """Names of all evaluations: environments, and :data:`ROUGH_GROUND` if the cell ``crosses`` tiles."""
-        return [*self.evaluated_in, *([ROUGH_GROUND] if self.crosses else [])]
+        """Names of all evaluations."""
+        return [*self.evaluated_in, *self.further]
 
     def result_file(self, evaluation: str) -> Path:
         """Return the file with the numbers of an evaluation of the last checkpoint."""
+        if evaluation.startswith(SWEEP):
+            return self.folder / f"sweep_{evaluation.removeprefix(SWEEP)}.json"
         return self.folder / ("grounds.json" if evaluation == ROUGH_GROUND else f"result_{evaluation}.json")
 
     def part_file(self, evaluation: str) -> Path:
@@ -81,13 +83,14 @@ class Matrix:
     train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, Any] = field(default_factory=dict)  # as EVALUATION
     grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
+    sweeps: dict[str, Any] = field(default_factory=dict)  # settings of each, by the parameter that is swept
     task_files: tuple[str, ...] = ()  # --task_file of the command line; a description cannot name any
 
     def cells(self, out: Path) -> list[Cell]:
         """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
-        crosses = bool(self.grounds)
+        further = (*([ROUGH_GROUND] if self.grounds else []), *(f"{SWEEP}{name}" for name in self.sweeps))
         return [
-            Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in), crosses)
+            Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in), further)
             for seed in self.seeds
             for environment, evaluated_in in self.environments.items()
             for task in self.tasks
@@ -98,9 +101,10 @@ class Matrix:
         evaluated = {f"environments.{name}": names for name, names in self.environments.items()}
         return {"tasks": self.tasks, "seeds": self.seeds, "environments": list(self.environments), **evaluated}
 
-    def set_words(self) -> list[str]:
-        """Return the changed settings of the trainings as ``--set`` takes them."""
-        return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in self.train.items()]
+    def set_words(self, sweep: str = "") -> list[str]:
+        """Return the changed settings of the trainings as ``--set`` takes them, or those of a sweep."""
+        changed = self.sweeps[sweep] if sweep else self.train
+        return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in changed.items()]
 
 
 KEYS = {name: hint for name, hint in types_of(Matrix).items() if name != "task_files"}
@@ -156,6 +160,9 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())
         of_tasks[cell.task] = env_cfg
+        for name in matrix.sweeps:
+            options.set = [*words, *matrix.set_words(name)]
+            draw_only(task_registry.get_cfgs(cell.task, options)[0], name)
     for env_cfg in of_tasks.values():
         load_asset(env_cfg)
     return matrix
@@ -180,6 +187,9 @@ def read_plan(file: Path) -> Matrix:
             if value == []:
                 raise UserError(f"{section}.{key} must hold one entry or more, not {value}")
     grounds = GROUNDS | values["grounds"] if values.get("grounds") else {}
+    for name, settings in values.get("sweeps", {}).items():
+        if not isinstance(settings, dict):
+            raise UserError(f"sweeps.{name} must hold settings, not {settings!r}")
     matrix = Matrix(**values | {"evaluation": EVALUATION | values.get("evaluation", {}), "grounds": grounds})
     for key, entries in matrix.lists().items():
         if not entries or len(set(entries)) < len(entries):
@@ -195,7 +205,7 @@ def check_same(matrix: Matrix, out: Path) -> None:
     if not (out / SETTINGS_FILE).is_file():
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
-    for section in ("train", "evaluation", "grounds"):
+    for section in ("train", "evaluation", "grounds", "sweeps"):
         was, now = getattr(old, section), getattr(matrix, section)
         for key in sorted(was.keys() | now.keys()):
             if was.get(key) != now.get(key):
@@ -217,7 +227,10 @@ def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> lis
             kinds, levels, num_envs = (matrix.grounds[key] for key in GROUNDS)
             words += [f"--num_envs={num_envs}", "--terrain", *kinds, "--level", *map(str, levels)]
         else:
-            words += [f"--perturbation={name}", f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
+            swept = name.removeprefix(SWEEP) if name.startswith(SWEEP) else ""
+            words += [f"--perturbation={'none' if swept else name}"]
+            words += [f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
+            words += [f"--sweep={swept}", *(f"--set={word}" for word in matrix.set_words(swept))] if swept else []
         return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         return ["train.py", *words, "--resume"]

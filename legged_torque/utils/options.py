@@ -15,6 +15,9 @@ CPU_PRESET = "laptop"  # chosen where there is no GPU
 DEFAULT_TASK = "a1_torque_multihead"
 MOTOR_FILES = (".yaml", ".yml")
 OF_MOTORS = ("motors", "domain_rand")  # sections that such files may have
+PUSH = "push_velocity"
+DELAYS = {"action_delay": "motors.delay.range", "sensing_delay": "sensing.delay.range"}
+"""What ``evaluate.py --sweep`` takes besides parameters of ``domain_rand``: pushes, and delays with their settings."""
 
 
 def _option(text: str, default: Any = None, **how: Any) -> Any:
@@ -147,6 +150,17 @@ def choose_motors(env_cfg: Any, name: str) -> None:
 def apply_perturbation(env_cfg: Any, name: str) -> None:
     """Apply one of the named sets of random events that a task's settings offer; an unknown name is a UserError."""
     update_from_dict(env_cfg, _named("perturbation", name, env_cfg.perturbations()))
+
+
+def draw_only(env_cfg: Any, name: str) -> None:
+    """Let a task draw a random parameter, and no other where it draws none; an unknown name is a UserError."""
+    rand, names = env_cfg.domain_rand, env_cfg.random_parameters()
+    if name not in {*names, *DELAYS, PUSH}:
+        raise unknown_name("random parameter", name, [*names, *DELAYS, PUSH])
+    if name == PUSH:
+        rand.push_robots = False  # the sweep pushes
+    if name in names and not rand.randomize_parameters:
+        rand.randomize_parameters, rand.keep_fixed = True, [other for other in names if other != name]
 
 
 def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def run_problems(run: Training, from_step: float) -> list[str]:
             problems.append(f"not evaluated in {in_words(name)}")
         elif not run.is_finished(steps := rows["steps"].iloc[-1]):
             problems.append(f"evaluated in {in_words(name)} after {steps / MILLION:.4g} of {total}")
-    if run.cell.crosses and run.crossings is None:
+    if ROUGH_GROUND in run.cell.further and run.crossings is None:
         problems.append(f"not evaluated on {ROUGH_GROUND}")
     return problems
 

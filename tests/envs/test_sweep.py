@@ -8,8 +8,9 @@ import torch
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 
 from legged_torque.envs.base.metrics import measure
-from legged_torque.envs.base.sweep import NUM_PARTS, PUSH, REST, WATCHED, PushSweep, Sweep, draw_only
+from legged_torque.envs.base.sweep import NUM_PARTS, REST, WATCHED, PushSweep, Sweep
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.options import PUSH, draw_only
 
 QUICK = {"domain_rand.resampling_probability": 0.2, "env.episode_length_s": 0.3, "commands.resampling_probability": 0.0}
 

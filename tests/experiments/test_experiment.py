@@ -42,6 +42,7 @@ def killed(tmp_path_factory):
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
     values["train"] |= {"runner.total_steps": 40 * 32, "runner.save_interval": 2}
     values |= {"tasks": ["a1_torque_multihead"], "environments": {"low": ["high"]}}
+    values["sweeps"] = {"action_delay": {"motors.delay.range": [0, 2]}}
     tmp_path = tmp_path_factory.mktemp("killed")
     file, out = write(tmp_path / "smoke.yaml", values), tmp_path / "out"
     command = [sys.executable, "-c", WATCHED, ROOT / "scripts" / "experiment.py"]
@@ -94,6 +95,8 @@ def test_smoke_experiment_runs_to_the_end(finished):
     result = json.loads((cell / "result_high.json").read_text())
     assert (result["task"], result["perturbation"]) == ("a1_torque_multihead", "high")
     assert (result["checkpoint"], result["num_envs"], result["num_steps"]) == ("model_40.pt", 4, 20)
+    swept = json.loads((cell / "sweep_action_delay.json").read_text())
+    assert (swept["perturbation"], [part["from"] for part in swept["sweep"]["parts"]]) == ("none", [0, 1, 2])
     log = (cell / "train.log").read_text()
     assert log.count("scripts/train.py") == 2 and log.count(" --resume") == 1 and "iteration 40 of 40, " in log
     assert f"{cell.name}: evaluation in high on cpu took" in output and not list(cell.glob("*.part"))
@@ -111,7 +114,10 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 1280 steps of training, " in spent
 
 
-@pytest.mark.parametrize(("name", "cells"), {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16}.items())
+CELLS = {"paper": 84, "hard": 28, "low": 12, "smoke": 2, "rough": 16, "robustness": 25}
+
+
+@pytest.mark.parametrize(("name", "cells"), CELLS.items())
 def test_dry_run(name, cells, tmp_path):
     """The experiments of this repository are valid; ``--dry-run`` lists their cells and touches nothing."""
     out = tmp_path / "out"
@@ -120,6 +126,7 @@ def test_dry_run(name, cells, tmp_path):
     assert (status, error) == (0, "") and not out.exists()
     assert len(output.splitlines()) == cells
     assert output.count(", rough ground\n") == (16 if name == "rough" else 0)
+    assert output.count(", sweep of push_velocity, ") == (25 if name == "robustness" else 0)
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
 

@@ -16,10 +16,9 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from support import quick_kernels
-from support.quick_kernels import PATHS
 from support.reproducible import differences, values
 from support.rollouts import make_ppo, record_rollout, state_of
+from support.scripts import PATHS
 from support.settings import parse
 
 from legged_torque.envs import task_registry
@@ -286,7 +285,6 @@ def test_two_machines_without_shared_files(together, tmp_path):
     kept = shutil.copytree(together[0] / "kept", runs / "2026-01-01_00-00-00")
     (tmp_path / "1").mkdir()
     words = [
-        quick_kernels.__file__,
         ROOT / "scripts" / "train.py",
         f"--task={TASK}",
         "--device=cpu",

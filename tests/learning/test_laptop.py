@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
-from support.quick_kernels import COMMAND, PATHS
+from support.scripts import COMMAND, PATHS
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum

@@ -11,8 +11,7 @@ import subprocess
 import torch
 import yaml
 from support.clock import wait_for
-from support.quick_kernels import COMMAND, PATHS
-from support.scripts import ROOT, SMALL, run_here
+from support.scripts import COMMAND, PATHS, ROOT, SMALL, run_here
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers

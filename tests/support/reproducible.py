@@ -5,8 +5,7 @@ import os
 import subprocess
 
 import torch
-from support.quick_kernels import COMMAND, PATHS
-from support.scripts import ROOT
+from support.scripts import COMMAND, PATHS, ROOT
 
 from legged_torque.utils.runs import find_checkpoint
 

@@ -12,6 +12,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+COMMAND = [sys.executable, "-u"]
+PATHS = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+"""Start a process that imports what this one can."""
 SMALL = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--set=runner.num_steps_per_env=4", "--max_iterations=2"]
 
 

@@ -20,8 +20,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from support.browser import complaints, screen
 from support.clock import wait_for as wait
-from support.quick_kernels import COMMAND, PATHS
-from support.scripts import run_here
+from support.scripts import COMMAND, PATHS, run_here
 from support.sessions import new_session, running
 
 from legged_torque import SCRIPTS_DIR

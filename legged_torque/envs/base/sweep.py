@@ -12,27 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.metrics import WalkingMetrics
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import estimate
+from legged_torque.utils.options import DELAYS, PUSH
 
 NUM_PARTS = 8
-PUSH = "push_velocity"
 REST, WATCHED = 2.0, 3.0  # seconds between pushes without and with a look at falls
-DELAYS = {"action_delay": "motors.delay.range", "sensing_delay": "sensing.delay.range"}
-"""Drawn at resets, as whole numbers, from these settings; all others are in ``domain_rand``."""
-
-
-def draw_only(cfg: LeggedRobotCfg, name: str) -> None:
-    """Let a task draw a parameter, and no other where it draws none; a UserError if there is none of this name."""
-    rand, names = cfg.domain_rand, cfg.random_parameters()
-    if name not in {*names, *DELAYS, PUSH}:
-        raise unknown_name("random parameter", name, [*names, *DELAYS, PUSH])
-    if name == PUSH:
-        rand.push_robots = False  # the sweep pushes
-    if name in names and not rand.randomize_parameters:
-        rand.randomize_parameters, rand.keep_fixed = True, [other for other in names if other != name]
 
 
 class Sweep:

@@ -1,0 +1,83 @@
+"""The figure of ``plot.py sweeps``: what policies bear, by the value of a parameter."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from legged_torque.paper.plotting import load_pyplot, save_figure
+from legged_torque.utils.cli import Parser, check_output
+from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import read_data
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+APPROACH = r"_(?=rough_|position|torque|multihead|variable_stiffness|decap|sata)"
+"""Where the name of a task's approach begins; what is before is its robot."""
+
+
+def plot_sweeps() -> None:
+    """Draw a row per robot, a column per parameter, and a line per approach.
+
+    Bands are 95% intervals, over worlds if there is one file, else over the files of different seeds.
+    """
+    example = "python scripts/plot.py sweeps sweeps/*.json --out sweeps.png"
+    parser = Parser(f"Draw what policies bear: ``{example}``.")
+    parser.add_argument("files", type=Path, nargs="+", help="JSON of evaluate.py --sweep")
+    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
+    args = parser.parse_args()
+    check_output(args.out)
+    pyplot = load_pyplot()
+    sweeps = [read_data(file, {"task", "sweep"}, "evaluate.py --sweep") for file in args.files]
+    robots, approaches = (
+        list(dict.fromkeys(re.split(APPROACH, each["task"], maxsplit=1)[place] for each in sweeps)) for place in (0, -1)
+    )
+    parameters = list(dict.fromkeys(each["sweep"]["parameter"] for each in sweeps))
+    size = (3.0 * len(parameters), 2.2 * len(robots) + 0.4)
+    figure, axes = pyplot.subplots(len(robots), len(parameters), figsize=size, layout="constrained", squeeze=False)
+    lines: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
+    for content in sweeps:
+        robot, *rest = re.split(APPROACH, content["task"], maxsplit=1)
+        lines[robot, (rest or [robot])[0], content["sweep"]["parameter"]].append(content["sweep"])
+    for (robot, approach, parameter), of_seeds in lines.items():
+        axis = axes[robots.index(robot), parameters.index(parameter)]
+        try:
+            _draw(axis, of_seeds, approach, f"C{approaches.index(approach)}")
+        except (LookupError, TypeError, ValueError) as error:
+            raise UserError(f"a sweep of {parameter} for {robot}_{approach} is not whole: {error!r}") from None
+    for row, robot in zip(axes, robots, strict=True):
+        row[0].annotate(robot, (-0.42, 0.5), xycoords="axes fraction", rotation=90, va="center", weight="bold")
+    axes[0, 0].legend(fontsize=8)
+    save_figure(figure, args.out)
+
+
+def _draw(axis: Axes, sweeps: list[dict[str, Any]], label: str, colour: str) -> None:
+    """Draw tracking, or the share that falls after a push, in the middle of each part; a delay is a whole number."""
+    sweep, parts = sweeps[0], sweeps[0]["parts"]
+    is_push, is_whole = "fell" in parts[0], sweep["parameter"].endswith("_delay")
+    x = [part["from"] if is_whole else (part["from"] + part["to"]) / 2.0 for part in parts]
+    shown = (lambda part: part["fell"]) if is_push else lambda part: part["metrics"]["track_percentage"]
+    rows = [[shown(part) for part in each["parts"]] for each in sweeps]
+    means = np.array([[each["mean"] for each in row] for row in rows], float)
+    mean, count = means.mean(axis=0), len(sweeps)
+    if count == 1:
+        half = 1.96 * np.array([each["standard_error"] for each in rows[0]], float)
+    else:
+        half = student(count) * means.std(axis=0, ddof=1) / math.sqrt(count)
+    axis.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
+    axis.plot(x, mean, color=colour, marker=".", label=label)
+    axis.set(ylim=(0.0, 1.0), xlabel=f"{sweep['parameter']} [{sweep['unit']}]" if sweep["unit"] else sweep["parameter"])
+    axis.set_ylabel("share that falls" if is_push else "tracking")
+
+
+def student(count: int) -> float:
+    """Return how many standard errors of a mean of ``count`` numbers are half its 95% interval."""
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, count - 1))
