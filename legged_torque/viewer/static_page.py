@@ -42,20 +42,21 @@ PACKAGES = {
 """Packages of the npm registry, their sha512, and the files that the page needs; of licences Apache-2.0 and MIT."""
 REGISTRY = "https://registry.npmjs.org/"
 OBSERVATIONS = ("projected_gravity", "angular_velocity", "command", "joint_position", "joint_velocity", "last_action")
-MOTORS = ("ideal", "curve", "friction")
-"""What the page can compute: observation terms, and models of motors."""
+ACTIONS, MOTORS = ("position_residual", "torque"), ("ideal", "curve", "friction")
+"""What the page can compute: terms of observations and actions, and models of motors."""
 
 
 def check(policy: Policy) -> None:
     """Refuse what the page cannot compute, with a UserError that lists it."""
     description = policy.description
-    terms, motors = description["observations"]["terms"], description.get("motors", {})
-    problems = [f"the observation {term['name']}" for term in terms if term["name"] not in OBSERVATIONS]
+    observed, acted = description["observations"], description["actions"]["terms"]
+    motors = description.get("motors", {})
+    problems = [f"the observation {term['name']}" for term in observed["terms"] if term["name"] not in OBSERVATIONS]
+    problems += [f"the actions {term['name']}" for term in acted if term["name"] not in ACTIONS]
+    problems += [f"an interval of {term['name']}" for term in acted if term.get("interval", 1) > 1]
     problems += [f"the motor {name}" for name, each in motors.items() if each["model"] not in MOTORS]
-    problems += ["a history of observations"] if description["observations"]["history_length"] > 1 else []
+    problems += ["a history of observations"] if observed["history_length"] > 1 else []
     problems += ["a recurrent network"] if "memory" in description["network"] else []
-    terms = description["actions"]["terms"]
-    problems += [f"an interval of {term['name']}" for term in terms if term.get("interval", 1) > 1]
     refuse(problems, "the page cannot compute")
 
 
@@ -105,14 +106,16 @@ def motors(description: dict[str, Any]) -> list[dict[str, Any]]:
 
 def write_robot(folder: Path, robot: MujocoRobot) -> list[str]:
     """Write the robot's MJCF with all files that it reads into one folder, and return their names, the MJCF's first."""
-    spec, names = robot.spec, ["robot.xml"]
+    spec, names, assets = robot.spec, ["robot.xml"], dict[str, bytes]()
     for kind, root in ((spec.meshes, spec.meshdir), (spec.textures, spec.texturedir)):
         for asset in kind:
             if asset.file:
                 names.append(f"{len(names)}{Path(asset.file).suffix}")
-                write_whole(folder / names[-1], (robot.file.parent / root / asset.file).read_bytes())
+                assets[names[-1]] = (robot.file.parent / root / asset.file).read_bytes()
+                write_whole(folder / names[-1], assets[names[-1]])
                 asset.file = names[-1]
     spec.meshdir = spec.texturedir = ""
+    spec.assets = assets  # they are read once more
     write_whole(folder / names[0], spec.to_xml())
     return names
 

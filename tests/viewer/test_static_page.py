@@ -1,0 +1,55 @@
+"""What a published page refuses, and files that it takes along; test_static_browser.py opens it."""
+
+import copy
+from types import SimpleNamespace
+
+import mujoco
+import pytest
+
+from legged_torque.deploy.policy import Policy
+from legged_torque.utils.errors import UserError
+from legged_torque.viewer import static_page
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+def test_refused():
+    """All that the page cannot compute is named at once; a policy without any of it passes."""
+    policy = Policy("go2/torque_multihead")
+    static_page.check(policy)
+    changed = copy.deepcopy(policy.description)
+    changed["observations"]["history_length"] = 2
+    changed["observations"]["terms"].append({"name": "height_scan"})
+    changed["actions"]["terms"][0] |= {"interval": 4}
+    changed["motors"]["heat"] = {"model": "thermal"}
+    with pytest.raises(UserError, match=r"the observation height_scan.*interval of position_res.*motor heat.*history"):
+        static_page.check(SimpleNamespace(description=changed))
+
+
+def test_files_of_the_robot(tmp_path):
+    """A mesh of another folder comes along, under a name that no path is in; both models are the same."""
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "part.obj").write_text(TETRAHEDRON)
+    mesh, body = '<mesh name="part" file="part.obj"/>', '<body><freejoint/><geom type="mesh" mesh="part"/></body>'
+    text = f'<mujoco><compiler meshdir="meshes"/><asset>{mesh}</asset><worldbody>{body}</worldbody></mujoco>'
+    (tmp_path / "robot.xml").write_text(text)
+    spec = mujoco.MjSpec.from_file(str(tmp_path / "robot.xml"))
+    mass = spec.compile().body_mass[1]
+    names = static_page.write_robot(tmp_path / "out", SimpleNamespace(spec=spec, file=tmp_path / "robot.xml"))
+    assert names == ["robot.xml", "1.obj"] == sorted((path.name for path in (tmp_path / "out").iterdir()), reverse=True)
+    (tmp_path / "meshes" / "part.obj").unlink()
+    assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml")).body_mass[1] == pytest.approx(mass)
+
+
+def test_libraries(tmp_path, monkeypatch):
+    """Without the registry, and with another file than the one that is expected, nothing is used."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(static_page, "REGISTRY", "http://127.0.0.1:9/")
+    package, (checksum, _) = next(iter(static_page.PACKAGES.items()))
+    with pytest.raises(UserError, match=r"cannot download http://127.0.0.1:9/@mujoco"):
+        static_page.library(package, checksum)
+    (tmp_path / "other.tgz").write_bytes(b"other")
+    monkeypatch.setattr(static_page, "REGISTRY", tmp_path.as_uri() + "/")
+    with pytest.raises(UserError, match=r"other.tgz is not the file that was expected"):
+        static_page.library("other.tgz", checksum)
+    assert not (tmp_path / "legged_torque").exists()
