@@ -49,7 +49,7 @@ class Sweep:
         if name in DELAYS:
             low, high, self.unit = round(low), round(high), getattr(task.cfg, setting.split(".")[0]).delay.unit
             parts = high - low
-        self.edges = torch.linspace(low, high, parts + 1).tolist()
+        self.edges = [float(f"{edge:.6g}") for edge in torch.linspace(low, high, parts + 1).tolist()]  # of float32
         self._metrics = [WalkingMetrics(task) for _ in range(parts)]
         self._before: Tensor | None = None
 
