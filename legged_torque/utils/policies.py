@@ -72,10 +72,13 @@ def name_of(folder: Path) -> str:
 
 
 def read_card(folder: Path) -> dict[str, Any]:
-    """Return the card of a policy's folder; a UserError if it has none."""
+    """Return the card of a policy's folder; a UserError if it has none, or one that names no files of the folder."""
     if not (folder / CARD).is_file():
         raise UserError(f"'{folder}' has no {CARD}")
-    card: dict[str, Any] = parse_yaml((folder / CARD).read_text("utf-8"), f"'{folder / CARD}'")
+    card: dict[str, Any] = parse_yaml((folder / CARD).read_text("utf-8", errors="replace"), f"'{folder / CARD}'")
+    files = card.get("files") if isinstance(card, dict) else None
+    if not files or not isinstance(files, dict) or any(Path(str(name)).name != name for name in files):
+        raise UserError(f"'{folder / CARD}' does not list the files of its folder under 'files'")
     return card
 
 

@@ -67,6 +67,17 @@ def test_up_and_down(script, server):
 
 
 @pytest.mark.parametrize(
+    "card", ["", "- 1", "files: {}", "files: 3", "files: {/dev/zero: 0}", "files: {../x: 0}", "a: ["]
+)
+def test_cards_of_strangers(script, server, card):
+    """A card that is none is refused, and reads no file elsewhere."""
+    server.models["me/odd"] = {"card.yaml": card.encode(), "policy.yaml": b"", "policy.onnx": b""}
+    status, _, errors = script("sim2sim.py", "hf:me/odd")
+    (line,) = [line for line in errors.splitlines() if "error: " in line]
+    assert status == 2 and ("does not list the files" in line or "is not valid YAML" in line)
+
+
+@pytest.mark.parametrize(
     ("words", "expected"),
     [
         (["sim2sim.py", "hf:me/none"], "cannot download the policy 'hf:me/none': 404"),
