@@ -119,6 +119,15 @@ def type_into(browser, label, value):
     field.send_keys(value, Keys.TAB)
 
 
+def type_until(browser, label, value, condition):
+    """Type a number until a condition holds: a busy page may lose keys."""
+    for _ in range(5):
+        type_into(browser, label, value)
+        with contextlib.suppress(AssertionError):
+            return wait(condition, TIMEOUT / 5)
+    raise AssertionError(f"'{value}' was typed into '{label}' without effect")
+
+
 def share(browser, is_meant, left=0.3, right=0.7, top=0.15, bottom=0.8):
     """The share of a part of the page, whose ends are shares, where a function accepts red, green and blue."""
     picture = np.array(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB")).astype(int)
@@ -275,8 +284,7 @@ def test_rough_ground(browser, tmp_path):
         open_page(browser, page.server.url)
         wait_for(is_seen)
         assert "discrete_obstacles, level 0 (difficulty 0.20)" in text_of(browser)
-        type_into(browser, "level", "1")
-        wait_for(lambda: session.task.terrain.levels.tolist() == [1, 1])
+        type_until(browser, "level", "1", lambda: session.task.terrain.levels.tolist() == [1, 1])
         walk(session, 0.1)
         wait_for(lambda: "level 1 (difficulty 0.50)" in text_of(browser))
     assert not [message for message in complaints(browser) if "ERR_CONNECTION" not in message]
