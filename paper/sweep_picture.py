@@ -35,16 +35,13 @@ def plot_sweeps() -> None:
     check_output(args.out)
     pyplot = load_pyplot()
     sweeps = [read_data(file, {"task", "sweep"}, "evaluate.py --sweep") for file in args.files]
-    robots, approaches = (
-        list(dict.fromkeys(re.split(APPROACH, each["task"], maxsplit=1)[place] for each in sweeps)) for place in (0, -1)
-    )
-    parameters = list(dict.fromkeys(each["sweep"]["parameter"] for each in sweeps))
-    size = (3.0 * len(parameters), 2.2 * len(robots) + 0.4)
-    figure, axes = pyplot.subplots(len(robots), len(parameters), figsize=size, layout="constrained", squeeze=False)
     lines: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
     for content in sweeps:
         robot, *rest = re.split(APPROACH, content["task"], maxsplit=1)
         lines[robot, (rest or [robot])[0], content["sweep"]["parameter"]].append(content["sweep"])
+    robots, approaches, parameters = (list(dict.fromkeys(names)) for names in zip(*lines, strict=True))
+    size = (3.0 * len(parameters), 2.2 * len(robots) + 0.4)
+    figure, axes = pyplot.subplots(len(robots), len(parameters), figsize=size, layout="constrained", squeeze=False)
     for (robot, approach, parameter), of_seeds in lines.items():
         axis = axes[robots.index(robot), parameters.index(parameter)]
         try:

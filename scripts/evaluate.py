@@ -5,6 +5,7 @@ Examples:
     python scripts/evaluate.py --task=a1_position --perturbation=high   # in another environment
     python scripts/evaluate.py --load_run RUN --command 0.5 0 0.2       # with one command
     python scripts/evaluate.py --terrain all --level 0.5                # on rough ground
+    python scripts/evaluate.py --sweep ground_friction                  # by the value of a random parameter
     python scripts/evaluate.py --all_checkpoints                        # a learning curve, for plot.py curves
 
 With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.

@@ -72,11 +72,10 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Simulation, evaluate
-        from legged_torque.viewer.static_page import check, write_page
+        from legged_torque.viewer.static_page import write_page
         from legged_torque.viewer.video import SimulationRecorder
     _, network = read(args.policy)
-    policy = Policy(args.policy)
-    check(policy)
+    policy = Policy(network)
     robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
     simulation = Simulation(policy, robot)
     recorder, part = SimulationRecorder(simulation), part_of(args.out)
@@ -89,11 +88,11 @@ def main() -> None:
         part.mkdir(parents=True)
         try:
             card = copy_policy(network, part, policy.description)
+            for note in write_page(part, policy, card["policy"]):
+                print(f"  note: {note}")
             metrics = evaluate(simulation, 1 if "metrics" in card else ROBOTS, STEPS, 1, on_step)
             numbers = {name: [round(value.mean, 5), round(value.standard_error, 5)] for name, value in metrics.items()}
             card.setdefault("metrics", {"plain MuJoCo": numbers})
-            for note in write_page(part, policy, card["policy"]):
-                print(f"  note: {note}")
             write_cards(part, card)
             part.rename(args.out)
         finally:
@@ -111,8 +110,8 @@ def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dic
     if (export / DESCRIPTION_FILE).is_file():  # the network holds it, too
         shutil.copy(export / DESCRIPTION_FILE, folder)
     if (export / CARD).is_file():
-        for name in (CONFIG_FILE, training["checkpoint"]):
-            shutil.copy(export / name, folder)
+        for file in filter(Path.is_file, (export / CONFIG_FILE, export / training["checkpoint"])):
+            shutil.copy(file, folder)
         return read_card(export)
     card = {"policy": f"{training['run']}, {description['task']}", "task": description["task"]}
     card |= {"steps": training["total_steps"], "versions": description["versions"]}
@@ -129,7 +128,7 @@ def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dic
 def write_cards(folder: Path, card: dict[str, Any]) -> None:
     """Write the card with the files' checksums, and README.md, which the Hub shows."""
     kinds = card["metrics"].items()
-    names = " | ".join(["perturbations", *SHOWN.values()])
+    names = " | ".join(["evaluation", *SHOWN.values()])
     rows = [" | ".join([kind, *("{:.3f} +- {:.3f}".format(*each[name]) for name in SHOWN)]) for kind, each in kinds]
     table = {"names": names, "lines": "---|" * len(SHOWN) + "---", "rows": "\n".join(f"| {row} |" for row in rows)}
     table["license_line"] = f"license: {card['license'].lower()}\n" if "license" in card else ""

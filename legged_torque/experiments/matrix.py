@@ -159,10 +159,10 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())
-        of_tasks[cell.task] = env_cfg
-        for name in matrix.sweeps:
+        for name in matrix.sweeps if cell.task not in of_tasks else ():
             options.set = [*words, *matrix.set_words(name)]
             draw_only(task_registry.get_cfgs(cell.task, options)[0], name)
+        of_tasks[cell.task] = env_cfg
     for env_cfg in of_tasks.values():
         load_asset(env_cfg)
     return matrix

@@ -28,7 +28,7 @@ KINDS = {
 
 
 def rows_of(page, header):
-    """Columns and rows of such a table, as lists of texts."""
+    """Columns and rows of the table of a page that begins with a header, as lists of texts."""
     lines = (DOCS / page).read_text("utf-8").splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith(f"| {header} |"))
     end = next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))
@@ -91,15 +91,18 @@ def test_latency():
 
 @pytest.mark.parametrize("column", KINDS)
 def test_rough_ground(column):
-    """Shares of robots that cross tiles, and tracking, over all difficulties."""
+    """Shares of robots that cross tiles, tracking and cost of transport, over all difficulties."""
     data = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.gz")
     columns, rows = rows_of("results.md", "policy | slopes, waves, flat")
     for policy, *numbers in rows:
         method, _, sight = policy.rpartition(", ")
         task = ROUGH[method] + ("_scan" if sight == "scan" else "")
         chosen = data[(data["task"] == task) & (data["commit"] != "older")]
-        value = chosen[chosen["kind"].isin(KINDS[column])]["crossed"].mean()
-        assert same(numbers[columns.index(column) - 1], value), (policy, column, value)
+        crossed = chosen[chosen["kind"].isin(KINDS[column])]["crossed"].mean()
+        cost = chosen[chosen["kind"] == "rough_slope"]["cost_of_transport"].mean()
+        values = {column: crossed, columns[-2]: chosen["track_percentage"].mean(), columns[-1]: cost}
+        for name, value in values.items():
+            assert same(numbers[columns.index(name) - 1], value), (policy, name, value)
 
 
 def test_sweeps():
@@ -118,6 +121,7 @@ def test_sweeps():
     for approach, words in (("torque_multihead", "of them"), ("position", "under PD")):
         fell = [f"{share:.2f}" for share in measured(approach, "push_velocity", "fell", 7)]
         assert f"{', '.join(fell[:3])} and {fell[3]} {words}" in text
-    mass = [("position", "trunk_mass", "track_percentage"), ("torque_multihead", "trunk_mass", "track_percentage")]
-    costs = [a - b for each in mass for a, b in zip(measured(*each, 0), measured(*each, 7), strict=True)]
-    assert f"cost quadrupeds {min(costs):.2f} to {max(costs):.2f} of tracking" in text
+    for approach, words in (("position", "of tracking with PD"), ("torque_multihead", "with torques")):
+        ends = (measured(approach, "trunk_mass", "track_percentage", place) for place in (0, 7))
+        costs = [light - heavy for light, heavy in zip(*ends, strict=True)]
+        assert f"{min(costs):.2f} to {max(costs):.2f} {words}" in text

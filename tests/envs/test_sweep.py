@@ -114,7 +114,7 @@ def test_what_cannot_be_split(make_task, name, settings, message):
 
 
 def test_script(tmp_path):
-    """Mistakes are told in a line; a table is printed and written."""
+    """Mistakes end with one line and status 2; a table is printed and written."""
     assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
     few = ["--num_envs=4", "--steps=3", "--device=cpu"]
     for words, message in (

@@ -27,7 +27,7 @@ def test_refused():
 
 
 def test_files_of_the_robot(tmp_path):
-    """A mesh of another folder comes along, under a name that no path is in; both models are the same."""
+    """A mesh of another folder is copied beside the MJCF, which reads it there; the mass stays the same."""
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes" / "part.obj").write_text(TETRAHEDRON)
     mesh, body = '<mesh name="part" file="part.obj"/>', '<body><freejoint/><geom type="mesh" mesh="part"/></body>'
