@@ -55,6 +55,11 @@ class MotorChain:
         for link in self.links.values():
             link.send(actions)
 
+    def finish_step(self) -> None:
+        """Sum up a control step after its physics steps; torch only."""
+        for link in self.links.values():
+            link.finish_step()
+
     def actions(self, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
         """Return the actions that have reached the motors by a physics step. Shape: (num_envs, num_actions)."""
         actions = self._actions

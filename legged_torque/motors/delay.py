@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from legged_torque.motors.config import DelayCfg
@@ -30,7 +29,6 @@ class ActionDelay(Motor):
         super().__init__(cfg, joints)
         times, jitter, unit_steps = cfg.counted("motors.delay", joints.dt, joints.decimation)
         self.queue = PacketQueue(joints.actions, joints.decimation, times, unit_steps, jitter, cfg.loss)
-        self._received = torch.zeros_like(joints.actions)
 
     def send(self, actions: Tensor) -> None:
         """Send the actions of this control step."""
@@ -39,8 +37,7 @@ class ActionDelay(Motor):
 
     def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
         """Return the actions that have reached the motors. Shape: (num_envs, num_actions)."""
-        self.queue.receive(substep, self._received)
-        return self._received
+        return self.queue.received(substep)
 
     def kernel_reads(self) -> Any:
         """Return the queue."""

@@ -238,8 +238,8 @@ class ModelMotor(Motor):
             setattr(self.values, name, self.buffer(name, len(joints.names), *self.formula.inner(self.values)))
         self.lost = self._buffers.get("lost")
 
-    def send(self, actions: Tensor) -> None:
-        """Begin a control step."""
+    def finish_step(self) -> None:
+        """Prepare the next control step."""
         if self.formula.begin:
             self._keep(self.formula.begin(torch, self.values))
 

@@ -43,6 +43,9 @@ class Motor(Buffers):
     def send(self, actions: Tensor) -> None:
         """Take the actions of a new control step, before its physics steps. Shape: (num_envs, num_actions)."""
 
+    def finish_step(self) -> None:
+        """Sum up a control step after its physics steps; torch only, so that it can be compiled."""
+
     def apply(self, wanted: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
         """Return the torques that come out of this link [N m]; runs at every physics step, inside a CUDA graph.
 

@@ -55,10 +55,7 @@ class Sensing:
 
     def look(self) -> None:
         """Write what has arrived, as the joint encoders give it."""
-        if self.queue.is_needed:
-            self.queue.receive(0, self._arrived)
-        else:
-            self._arrived.copy_(self._packet())
+        self._arrived.copy_(self.queue.received(0) if self.queue.is_needed else self._packet())
         if self._motors.encoder:
             pos, vel = self._motors.measured(self.dof_pos, self.dof_vel)
             self.dof_pos.copy_(pos)

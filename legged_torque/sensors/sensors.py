@@ -40,7 +40,7 @@ class Sensors(dict[str, Sensor]):
         sensing = Sensing(cfg.sensing.delay, state, motors, cfg.sim.dt, cfg.control.decimation)
         self.sensing = sensing if sensing.queue.is_needed or motors.encoder else None
         self._is_late = bool(self.sensing) and sensing.queue.is_needed
-        self.has_kernels = self._is_late or not all(sensor.compilable for sensor in self.values())
+        self.has_kernels = not all(sensor.compilable for sensor in self.values())
 
     def begin_step(self) -> list[Callable[[], None]]:
         """Begin a control step; return what to call after each physics step, if sensors measure then."""
@@ -59,7 +59,7 @@ class Sensors(dict[str, Sensor]):
         for sensor in self.values():
             if sensor.compilable == compilable:
                 sensor.update(is_new)
-        if self.sensing and compilable != self._is_late:
+        if self.sensing and compilable:
             self.sensing.look()
 
     @contextlib.contextmanager

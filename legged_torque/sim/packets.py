@@ -33,19 +33,6 @@ def received_packet(queue: Queue, world: int, elapsed: int) -> wp.array[float]:
 
 
 @wp.kernel(enable_backward=False)
-def receive_packet(
-    # In:
-    queue: Queue,
-    elapsed: int,
-    # Out:
-    received: wp.array2d[float],
-):
-    """Write one number of the packet that a world's receiver has."""
-    world, column = wp.tid()  # type: ignore[misc]
-    received[world, column] = received_packet(queue, world, elapsed)[column]
-
-
-@wp.kernel(enable_backward=False)
 def send_packet(
     # In:
     packet: wp.array2d[float],
@@ -125,6 +112,7 @@ class PacketQueue(Buffers):
         self.newest = self.buffer("newest", width) if self.is_needed else like
         self.before, self.drawn = self.buffer("before", self.depth, width), self.buffer("drawn", 1)
         self.extra = self.buffer("extra", self.depth + 1) if jitter else torch.zeros_like(self.drawn)
+        self._numbers = torch.arange(self.depth, device=like.device)
         seeds = self.num_envs if jitter or loss else 0
         self.seeds = torch.zeros(seeds, dtype=torch.int32, device=like.device)
 
@@ -141,10 +129,18 @@ class PacketQueue(Buffers):
             sent, other, seeds, *queue = (wp.from_torch(array) for array in arrays)
             wp.launch(send_packet, queue[0].shape, [sent, other, seeds, *chances, *queue], device=sent.device)
 
-    def receive(self, elapsed: int, out: Tensor) -> None:
-        """Write the packet that the receiver has some physics steps after the newest was sent. Shape: as of it."""
-        received = wp.from_torch(out)
-        wp.launch(receive_packet, received.shape, [self.reads(), elapsed, received], device=received.device)
+    def received(self, elapsed: int) -> Tensor:
+        """Return the packet that the receiver has some physics steps after the newest was sent, by torch only.
+
+        Shape: (num_envs, width).
+        """
+        if not self.depth:
+            return self.newest
+        missing = self.drawn.clamp(0.0, 1.0e6).int() * self.unit_steps - elapsed
+        waiting = missing - self._numbers * self.interval + self.extra[:, : self.depth] > 0.0
+        age = torch.where(waiting, self.depth, self._numbers).amin(dim=1, keepdim=True)
+        older = self.before.take_along_dim((age - 1).clamp(min=0).unsqueeze(2), dim=1).squeeze(1)
+        return torch.where(age > 0, older, self.newest)
 
     def reads(self) -> Queue:
         """Return the inputs of :func:`received_packet`."""

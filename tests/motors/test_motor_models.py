@@ -143,7 +143,7 @@ def computed():
         inputs = [torch.tensor(values[step]) for values in (wanted, pos, vel)]
         if step % DECIMATION == 0:
             for link in (*in_torch.values(), *in_kernel.values()):
-                link.send(torch.zeros(WORLDS, 3))
+                link.finish_step()
         wp.launch(evaluate_all, (WORLDS, 3), [*reads, *map(wp.from_torch, (*inputs, out))], device="cpu")
         for number, model in enumerate(CONSTANTS):
             found["torch", model][step] = in_torch[model].apply(*inputs, step % DECIMATION)

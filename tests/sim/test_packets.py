@@ -5,7 +5,7 @@ import pytest
 import torch
 import warp as wp
 
-from legged_torque.sim.packets import PacketQueue
+from legged_torque.sim.packets import PacketQueue, Queue, received_packet
 
 WORLDS = 400
 
@@ -22,11 +22,19 @@ def fate(seeds: wp.array(dtype=int), loss: float, jitter: int, lost: wp.array(dt
     late[world] = wp.randi(state, 0, jitter + 1)
 
 
+@wp.kernel(module="unique")
+def receive(queue: Queue, elapsed: int, received: wp.array2d(dtype=float)):
+    """Copy what each world has received."""
+    world, column = wp.tid()
+    received[world, column] = received_packet(queue, world, elapsed)[column]
+
+
 def received(queue, elapsed=0):
-    """What each world has received."""
-    out = torch.zeros(WORLDS, 2)
-    queue.receive(elapsed, out)
-    return out.numpy()
+    """What each world has received, by torch and by a kernel alike."""
+    in_torch, in_kernel = queue.received(elapsed), torch.zeros(WORLDS, 2)
+    wp.launch(receive, in_kernel.shape, [queue.reads(), elapsed, wp.from_torch(in_kernel)])
+    assert torch.equal(in_torch, in_kernel)
+    return in_torch.numpy()
 
 
 @pytest.mark.parametrize(

@@ -208,6 +208,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """Count the step, look at the state, and compute ends and rewards; torch only, so that it can be compiled."""
         self.state.episode_length.add_(1)
         self.total_steps.add_(self.num_envs * self.num_processes)
+        self.motors.finish_step()
         self.state.update()
         self._post_physics_step_callback()
         self.check_termination()
