@@ -86,6 +86,8 @@ def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, trace
         with CompileProgress():
             task, runner = build(task_name, cfgs, memory.device, folder)
             built = time.perf_counter()
+            while not runner.alg.due():  # a learner may collect for a while before its first update
+                runner.collect_rollout()
             time_iterations(runner, WARM_UP, lambda number: used.append(memory.used()))
         startup = time.perf_counter() - start
         times = time_iterations(runner, rounds)

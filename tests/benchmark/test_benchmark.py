@@ -57,6 +57,17 @@ def test_numbers_belong_together(measured):
         assert 50 < row["peak_memory_mib"] <= row["left_memory_mib"] < 50_000  # on the CPU memory only grows
 
 
+def test_learner_that_collects_first(tmp_path):
+    """Iterations of FlashSAC are timed from its first update on."""
+    sizes = {"buffer_min_length": 24, "replay_buffer_size": 100, "mini_batch_size": 4, "critic.hidden_dim": 64}
+    words = [f"--set=flashsac.{name}={size}" for name, size in sizes.items()]
+    words += ["--task=a1_position", "--preset=flashsac", "--num_envs=4", "--set=runner.num_steps_per_env=2"]
+    status, _, error = run_here("benchmark.py", *words, "--device=cpu", "--rounds=1", f"--json={tmp_path}/out.json", root=tmp_path)
+    assert (status, error) == (0, "")
+    (row,) = json.loads((tmp_path / "out.json").read_text())["rows"]
+    assert row["update_ms"] > 0
+
+
 def test_trace(runner, tmp_path):
     """The trace is JSON that has the traced iterations with their rollouts and updates; a table has the operators."""
     lines = benchmark.trace_iterations(runner, tmp_path / "trace.json.gz")
