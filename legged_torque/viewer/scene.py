@@ -46,7 +46,7 @@ HALF_HEIGHT = math.tan(0.5 * FIELD_OF_VIEW)  # of what is seen at a distance of 
 REACH = 0.45  # of a robot with its name around its trunk's origin, for the A1 [m]
 VIEW_FROM, VIEW_TO = np.array([1.2, -1.2, 0.62]), np.array([0.0, 0.0, 0.24])  # place and target, for the A1 [m]
 PHONE_FROM, PHONE_TO = np.array([1.85, -1.85, 1.0]), np.array([0.0, 0.0, -0.45])  # the same above a phone's controls
-PHONE = 0.6  # ratio of width to height below which a view is a phone's
+PHONE = 0.57  # ratio of width to height below which a view is a phone's, 16:9; between panels it may be just above
 TWO_ROBOTS = 1.5  # factor on the camera's distance for two robots side by side
 LIFTING, TOLERANCE = 0.2, 0.01  # share of its way up that a camera moves per frame; way that is ignored [m]
 

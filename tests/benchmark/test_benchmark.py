@@ -62,7 +62,9 @@ def test_learner_that_collects_first(tmp_path):
     sizes = {"buffer_min_length": 24, "replay_buffer_size": 100, "mini_batch_size": 4, "critic.hidden_dim": 64}
     words = [f"--set=flashsac.{name}={size}" for name, size in sizes.items()]
     words += ["--task=a1_position", "--preset=flashsac", "--num_envs=4", "--set=runner.num_steps_per_env=2"]
-    status, _, error = run_here("benchmark.py", *words, "--device=cpu", "--rounds=1", f"--json={tmp_path}/out.json", root=tmp_path)
+    status, _, error = run_here(
+        "benchmark.py", *words, "--device=cpu", "--rounds=1", f"--json={tmp_path}/out.json", root=tmp_path
+    )
     assert (status, error) == (0, "")
     (row,) = json.loads((tmp_path / "out.json").read_text())["rows"]
     assert row["update_ms"] > 0

@@ -74,19 +74,20 @@ def test_hard_ranges():
 
 
 def test_latency():
-    """Lowest and highest seed by latency."""
+    """Lowest and highest seed of policies that were trained without latency."""
     data = pd.read_csv(DOCS / "results" / "latency.csv")
-    data = data[data["robot"] == "a1"].replace({"trained_with": {"real": "late"}})
-    _, rows = rows_of("randomization.md", "policy, trained")
-    methods = {"PD": "position", "torque multi-head": "torque_multihead"}
-    for policy, *cells in rows:
-        method, trained = policy.split(", ")
-        chosen = data[(data["method"] == methods[method]) & (data["trained_with"] == trained)]
-        for cell, latency in zip(cells, (0, 10, 20, 30, 20), strict=True):
-            metric = "falls_per_minute" if cell is cells[-1] else "track_percentage"
-            values = chosen[chosen["latency_ms"] == str(latency)][metric]
-            for number, value in zip(cell.split(", "), (values.min(), values.max()), strict=True):
-                assert same(number, value), (policy, latency, number, value)
+    data = data[(data["robot"] == "a1") & (data["trained_with"] == "ideal") & (data["latency_ms"] == "20")]
+    torque, position = (data[data["method"] == method] for method in ("torque_multihead", "position"))
+    tracks = [
+        f"tracks {of['track_percentage'].min():.3f} to {of['track_percentage'].max():.3f}" for of in (torque, position)
+    ]
+    falls = torque["falls_per_minute"]
+    text = " ".join((DOCS / "randomization.md").read_text("utf-8").split())
+    assert (
+        f"torque multi-head {tracks[0]} with actions 20 ms late, and falls {falls.min():.0f} to {falls.max():.0f} "
+        in text
+    )
+    assert f"PD {tracks[1]}" in text
 
 
 @pytest.mark.parametrize("column", KINDS)
@@ -105,23 +106,91 @@ def test_rough_ground(column):
             assert same(numbers[columns.index(name) - 1], value), (policy, name, value)
 
 
-def test_sweeps():
-    """What the sentences on latency, pushes and payloads say of the quadrupeds."""
-    data = pd.read_csv(DOCS / "results" / "sweeps.csv.gz").set_index(["task", "parameter", "metric"]).sort_index()
+@pytest.fixture(scope="module")
+def swept():
+    """Sweeps of newly trained A1s."""
+    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz")
+    return data.set_index(["trained", "parameter", "metric", "from", "task"]).sort_index()["mean"]
+
+
+def test_cures_of_latency(swept):
+    """Lowest and highest seed by latency and training, and of falls after pushes."""
+    trained = {
+        "10 ms": "late by 0 to 10 ms",
+        "30 ms": "late by 0 to 30 ms",
+        "10 ms, damping": "damping on the drive",
+        "30 ms, damping": "late by 0 to 30 ms, damping on the drive",
+        "10 ms, 200 Hz": "policy at 200 Hz",
+    }
+    columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
+    columns.append(("push_velocity", "fell", 3.5))
+    _, rows = rows_of("results.md", "policy, latest actions in training")
+    assert len(rows) == 11
+    for policy, *cells in rows:
+        method, how = policy.split(", ", 1)
+        for cell, column in zip(cells, columns, strict=True):
+            key = (trained[how], *column, TASKS[method])
+            if cell == "–":
+                assert key not in swept.index
+                continue
+            values = swept.loc[key]
+            assert len(values) == (5 if how == "10 ms" else 3)
+            for number, value in zip(cell.split(", "), (values.min(), values.max()), strict=True):
+                assert same(number, value), (policy, column, number, value)
+
+
+def test_what_policies_bear(swept):
+    """What the sentences on pushes, latency, payload and energy say of five approaches."""
     text = " ".join((DOCS / "results.md").read_text("utf-8").partition("## What policies bear")[2].split())
+    base = swept.loc["late by 0 to 10 ms"]
+    pushed = base.loc["push_velocity", "fell", 3.5].groupby("task").mean()
+    methods = ("a1_position", "a1_torque", "a1_torque_multihead")
+    last = ("a1_torque_curriculum_multihead", "a1_torque_curriculum")
+    words = ("{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
+             "the combination and {:.2f} under the curriculum")  # fmt: skip
+    assert words.format(*pushed[[*methods, *last]]) in text
+    late = base.loc["action_delay", "track_percentage", 6.0]
+    torque = late[[task for task in set(late.index) if task != "a1_position"]]
+    assert f"PD tracks {late['a1_position'].min():.2f} to {late['a1_position'].max():.2f}, the four" in text
+    assert f"approaches {torque.min():.2f} to {torque.max():.2f}." in text
+    masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
+    costs = masses.iloc[0] - masses.iloc[-1]
+    others = costs.drop("a1_position")
+    assert f"costs PD {costs['a1_position']:.3f}" in text and f"{others.min():.3f} to {others.max():.3f}. From" in text
+    energy = [base.loc["action_delay", "cost_of_transport", steps] for steps in (0.0, 2.0)]
+    ends = [(of[task].min(), of[task].max()) for of in energy for task in ("a1_torque_multihead", "a1_position")]
+    for low, high in ends:
+        assert f"{low:.3f} to {high:.3f}" in text
 
-    def measured(approach, parameter, metric, place):
-        tasks = [f"{robot}_{approach}" for robot in ("a1", "go1", "go2", "anymal_c")]
-        return [data.loc[(task, parameter, metric)].sort_values("from")["mean"].iloc[place] for task in tasks]
 
-    late = {name: measured(name, "action_delay", "track_percentage", 6) for name in ("position", "torque_multihead")}
-    first, second, third, anymal = late["torque_multihead"]
-    assert f"tracks {min(late['position']):.2f} to {max(late['position']):.2f}, torque multi-head" in text
-    assert f"{second:.2f}, {third:.2f}, {first:.2f} and, the ANYmal's, {anymal:.2f}" in text
-    for approach, words in (("torque_multihead", "of them"), ("position", "under PD")):
-        fell = [f"{share:.2f}" for share in measured(approach, "push_velocity", "fell", 7)]
-        assert f"{', '.join(fell[:3])} and {fell[3]} {words}" in text
-    for approach, words in (("position", "of tracking with PD"), ("torque_multihead", "with torques")):
-        ends = (measured(approach, "trunk_mass", "track_percentage", place) for place in (0, 7))
-        costs = [light - heavy for light, heavy in zip(*ends, strict=True)]
-        assert f"{min(costs):.2f} to {max(costs):.2f} {words}" in text
+def test_sweeps():
+    """What is said of the latency of bundled policies."""
+    data = pd.read_csv(DOCS / "results" / "sweeps.csv.gz")
+    data = data[(data["parameter"] == "action_delay") & (data["metric"] == "track_percentage") & (data["from"] == 6)]
+    of = data.set_index("task")["mean"]
+    ends = []
+    for approach in ("position", "torque_multihead"):
+        tracking = of[[f"{robot}_{approach}" for robot in ("go1", "go2", "anymal_c")]]
+        ends.append(f"{tracking.min():.2f} to {tracking.max():.2f}")
+    text = " ".join((DOCS / "results.md").read_text("utf-8").split())
+    assert f"with 30 ms PD tracks {ends[0]}, torque multi-head {ends[1]} (" in text
+
+
+def test_few_worlds():
+    """What is said of 2048 worlds: steps until 70%, and tracking in the last tenth of trainings."""
+    data = pd.read_csv(DOCS / "tried.csv.gz")
+    found = {}
+    for (task, changes, seed), run in data[data["run"] == "worlds/shared"].groupby(["task", "changes", "seed"]):
+        end = run[run["steps"] > 0.9 * run["steps"].max()]["track_percentage"].mean()
+        reached = run[run["track_percentage"] >= 0.7]["steps"].min() / 1e6
+        worlds = 2048 if "--num_envs 2048" in changes else 4096
+        found[task.startswith("anymal"), worlds, task, seed] = {"end": end, "reached": reached}
+    few, many = (pd.DataFrame(found).T.xs(worlds, level=1) for worlds in (2048, 4096))
+    more = (few["end"] - many["end"]).loc[False]
+    steps = [f"{of.min():.0f} to {of.max():.0f}" for of in (few.loc[False]["reached"], many.loc[False]["reached"])]
+    failed = few[few["reached"].isna()]["end"]
+    text = " ".join((DOCS / "tried.md").read_text("utf-8").split())
+    assert f"after {steps[0]} million steps with 2048 worlds, after {steps[1]} with 4096" in text
+    assert f"track {-more.min():.3f} less to {more.max():.3f} more" in text
+    assert f"walk ({failed.iloc[0]:.3f} and {failed.iloc[1]:.3f}; all" in text and len(failed) == 2
+    assert many["reached"].notna().all()
