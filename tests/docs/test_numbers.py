@@ -27,6 +27,11 @@ KINDS = {
 }
 
 
+def text_of(page, heading):
+    """A page from a heading on, in one line."""
+    return " ".join((DOCS / page).read_text("utf-8").partition(heading)[2].split())
+
+
 def rows_of(page, header):
     """Columns and rows of the table of a page that begins with a header, as lists of texts."""
     lines = (DOCS / page).read_text("utf-8").splitlines()
@@ -75,19 +80,14 @@ def test_hard_ranges():
 
 def test_latency():
     """Lowest and highest seed of policies that were trained without latency."""
-    data = pd.read_csv(DOCS / "results" / "latency.csv")
-    data = data[(data["robot"] == "a1") & (data["trained_with"] == "ideal") & (data["latency_ms"] == "20")]
-    torque, position = (data[data["method"] == method] for method in ("torque_multihead", "position"))
-    tracks = [
-        f"tracks {of['track_percentage'].min():.3f} to {of['track_percentage'].max():.3f}" for of in (torque, position)
-    ]
-    falls = torque["falls_per_minute"]
-    text = " ".join((DOCS / "randomization.md").read_text("utf-8").split())
+    data = pd.read_csv(DOCS / "results" / "latency.csv").set_index(["robot", "trained_with", "latency_ms", "method"])
+    torque, position = (data.loc[("a1", "ideal", "20", method)] for method in ("torque_multihead", "position"))
+    low, high = ((of["track_percentage"].min(), of["track_percentage"].max()) for of in (torque, position))
+    falls, text = torque["falls_per_minute"], text_of("randomization.md", "## Delays")
+    assert f"{low[0]:.3f} to {low[1]:.3f} with actions 20 ms late" in text
     assert (
-        f"torque multi-head {tracks[0]} with actions 20 ms late, and falls {falls.min():.0f} to {falls.max():.0f} "
-        in text
+        f"falls {falls.min():.0f} to {falls.max():.0f} times a minute; PD tracks {high[0]:.3f} to {high[1]:.3f}" in text
     )
-    assert f"PD {tracks[1]}" in text
 
 
 @pytest.mark.parametrize("column", KINDS)
@@ -115,13 +115,8 @@ def swept():
 
 def test_cures_of_latency(swept):
     """Lowest and highest seed by latency and training, and of falls after pushes."""
-    trained = {
-        "10 ms": "late by 0 to 10 ms",
-        "30 ms": "late by 0 to 30 ms",
-        "10 ms, damping": "damping on the drive",
-        "30 ms, damping": "late by 0 to 30 ms, damping on the drive",
-        "10 ms, 200 Hz": "policy at 200 Hz",
-    }
+    trained = {"10 ms": "late by 0 to 10 ms", "30 ms": "late by 0 to 30 ms", "10 ms, damping": "damping on the drive"}
+    trained |= {"30 ms, damping": "late by 0 to 30 ms, damping on the drive", "10 ms, 200 Hz": "policy at 200 Hz"}
     columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
     columns.append(("push_velocity", "fell", 3.5))
     _, rows = rows_of("results.md", "policy, latest actions in training")
@@ -130,67 +125,45 @@ def test_cures_of_latency(swept):
         method, how = policy.split(", ", 1)
         for cell, column in zip(cells, columns, strict=True):
             key = (trained[how], *column, TASKS[method])
-            if cell == "–":
-                assert key not in swept.index
-                continue
-            values = swept.loc[key]
-            assert len(values) == (5 if how == "10 ms" else 3)
-            for number, value in zip(cell.split(", "), (values.min(), values.max()), strict=True):
-                assert same(number, value), (policy, column, number, value)
+            assert (cell == "–") == (key not in swept.index)
+            if cell != "–":
+                values = swept.loc[key]
+                assert len(values) == (5 if how == "10 ms" else 3)
+                low, high = cell.split(", ")
+                assert same(low, values.min()) and same(high, values.max()), (policy, column)
 
 
 def test_what_policies_bear(swept):
     """What the sentences on pushes, latency, payload and energy say of five approaches."""
-    text = " ".join((DOCS / "results.md").read_text("utf-8").partition("## What policies bear")[2].split())
-    base = swept.loc["late by 0 to 10 ms"]
+    text, base = text_of("results.md", "## What policies bear"), swept.loc["late by 0 to 10 ms"]
     pushed = base.loc["push_velocity", "fell", 3.5].groupby("task").mean()
-    methods = ("a1_position", "a1_torque", "a1_torque_multihead")
-    last = ("a1_torque_curriculum_multihead", "a1_torque_curriculum")
-    words = ("{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
-             "the combination and {:.2f} under the curriculum")  # fmt: skip
-    assert words.format(*pushed[[*methods, *last]]) in text
+    names = ("position", "torque", "torque_multihead", "torque_curriculum_multihead", "torque_curriculum")
+    words = "{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
+    words += "the combination and {:.2f} under the curriculum"
+    assert words.format(*pushed[[f"a1_{name}" for name in names]]) in text
     late = base.loc["action_delay", "track_percentage", 6.0]
-    torque = late[[task for task in set(late.index) if task != "a1_position"]]
-    assert f"PD tracks {late['a1_position'].min():.2f} to {late['a1_position'].max():.2f}, the four" in text
-    assert f"approaches {torque.min():.2f} to {torque.max():.2f}." in text
+    position, torque = late["a1_position"], late.drop("a1_position")
+    assert (
+        f"PD tracks {position.min():.2f} to {position.max():.2f}, the four torque approaches {torque.min():.2f} to "
+        in text
+    )
+    assert f" to {torque.max():.2f}. Late measurements" in text
     masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     costs = masses.iloc[0] - masses.iloc[-1]
     others = costs.drop("a1_position")
     assert f"costs PD {costs['a1_position']:.3f}" in text and f"{others.min():.3f} to {others.max():.3f}. From" in text
-    energy = [base.loc["action_delay", "cost_of_transport", steps] for steps in (0.0, 2.0)]
-    ends = [(of[task].min(), of[task].max()) for of in energy for task in ("a1_torque_multihead", "a1_position")]
-    for low, high in ends:
-        assert f"{low:.3f} to {high:.3f}" in text
+    for steps in (0.0, 2.0):
+        for task in ("a1_torque_multihead", "a1_position"):
+            energy = base.loc["action_delay", "cost_of_transport", steps, task]
+            assert f"{energy.min():.3f} to {energy.max():.3f}" in text
 
 
 def test_sweeps():
     """What is said of the latency of bundled policies."""
-    data = pd.read_csv(DOCS / "results" / "sweeps.csv.gz")
-    data = data[(data["parameter"] == "action_delay") & (data["metric"] == "track_percentage") & (data["from"] == 6)]
-    of = data.set_index("task")["mean"]
-    ends = []
+    data = pd.read_csv(DOCS / "results" / "sweeps.csv.gz").set_index(["parameter", "metric", "from", "task"])["mean"]
+    late, ends = data["action_delay", "track_percentage", 6.0], []
     for approach in ("position", "torque_multihead"):
-        tracking = of[[f"{robot}_{approach}" for robot in ("go1", "go2", "anymal_c")]]
+        tracking = late[[f"{robot}_{approach}" for robot in ("go1", "go2", "anymal_c")]]
         ends.append(f"{tracking.min():.2f} to {tracking.max():.2f}")
-    text = " ".join((DOCS / "results.md").read_text("utf-8").split())
+    text = text_of("results.md", "## What policies bear")
     assert f"with 30 ms PD tracks {ends[0]}, torque multi-head {ends[1]} (" in text
-
-
-def test_few_worlds():
-    """What is said of 2048 worlds: steps until 70%, and tracking in the last tenth of trainings."""
-    data = pd.read_csv(DOCS / "tried.csv.gz")
-    found = {}
-    for (task, changes, seed), run in data[data["run"] == "worlds/shared"].groupby(["task", "changes", "seed"]):
-        end = run[run["steps"] > 0.9 * run["steps"].max()]["track_percentage"].mean()
-        reached = run[run["track_percentage"] >= 0.7]["steps"].min() / 1e6
-        worlds = 2048 if "--num_envs 2048" in changes else 4096
-        found[task.startswith("anymal"), worlds, task, seed] = {"end": end, "reached": reached}
-    few, many = (pd.DataFrame(found).T.xs(worlds, level=1) for worlds in (2048, 4096))
-    more = (few["end"] - many["end"]).loc[False]
-    steps = [f"{of.min():.0f} to {of.max():.0f}" for of in (few.loc[False]["reached"], many.loc[False]["reached"])]
-    failed = few[few["reached"].isna()]["end"]
-    text = " ".join((DOCS / "tried.md").read_text("utf-8").split())
-    assert f"after {steps[0]} million steps with 2048 worlds, after {steps[1]} with 4096" in text
-    assert f"track {-more.min():.3f} less to {more.max():.3f} more" in text
-    assert f"walk ({failed.iloc[0]:.3f} and {failed.iloc[1]:.3f}; all" in text and len(failed) == 2
-    assert many["reached"].notna().all()

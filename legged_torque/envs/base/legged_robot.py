@@ -338,9 +338,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._use_attributes_of(self.state)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
-        clock = (cfg.sim.dt, cfg.control.decimation)
-        constants, control = (self.dof_names, self.torque_limits, armature), self.control
-        targets = (control.default_dof_pos, (control.p_gains, control.d_gains))
+        constants, clock = (self.dof_names, self.torque_limits, armature), (cfg.sim.dt, cfg.control.decimation)
+        targets = (self.default_dof_pos, (self.p_gains, self.d_gains))
         self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, *targets))
         self.motor_strength = self.motors.strength
         self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
