@@ -52,8 +52,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     """A batch of robots with position control, and what all approaches share.
 
     An approach overrides :meth:`action_terms`, or :meth:`_compute_torques` in torch, adds ``_reward_<term>`` methods or
-    :meth:`observation_terms`, or overrides the curriculum hook :meth:`update_curriculum`. What runs inside a step obeys
-    the rules of :class:`BaseTask`.
+    :meth:`observation_terms`, or overrides the hook :meth:`update_curriculum`, by the rules of :class:`BaseTask`.
 
     The attributes with legged_gym's names are tensors of :attr:`state` and :attr:`control`, see
     :class:`~legged_torque.envs.base.state.RobotState` and :class:`~legged_torque.envs.base.actions.ControlParameters`.
@@ -338,8 +337,9 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._use_attributes_of(self.state)
         self._given_actions, self._wanted_torques = torch.zeros_like(self.actions), torch.zeros_like(self.dof_vel)
         armature = torch.tensor(asset.mj_model.dof_armature[6:], dtype=torch.float32, device=self.device)
-        constants, clock = (self.dof_names, self.torque_limits, armature), (cfg.sim.dt, cfg.control.decimation)
-        targets = (self.default_dof_pos, (self.p_gains, self.d_gains))
+        clock = (cfg.sim.dt, cfg.control.decimation)
+        constants, control = (self.dof_names, self.torque_limits, armature), self.control
+        targets = (control.default_dof_pos, (control.p_gains, control.d_gains))
         self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, *targets))
         self.motor_strength = self.motors.strength
         self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
