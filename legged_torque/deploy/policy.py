@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from legged_torque.deploy.description import SCHEMA, from_metadata, metadata, open_network, read
-from legged_torque.motors.twin import without_function
+from legged_torque.motors.twin import constants, without_function
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
@@ -45,8 +45,6 @@ class Policy:
     Call :meth:`observation` and :meth:`act` once per control step, and :meth:`torques` at every physics step, or once
     if ``refresh_torques`` is false.
 
-    Its terms are computed by :data:`OBSERVATIONS` and :data:`ACTIONS`.
-
     Attributes:
         description: Contents of ``policy.yaml``.
         joint_order: Names of the joints, in the order of all vectors of joints.
@@ -76,6 +74,9 @@ class Policy:
         self.torque_limits = self._by_joint(self.description["torque_limits"]).T
         gains = self.description["gains"]
         self.stiffness, self.damping = self._by_joint(gains["stiffness"]), self._by_joint(gains["damping"])
+        models = self.description.get("motors", {}).items()
+        drives = [constants(m, self.joint_order, f"motors.{name}", 0.0) for name, m in models if m["model"] == "drive"]
+        self._drive_gains = [sum(drive[gain] for drive in drives) for gain in ("stiffness", "damping")]
         self._action_terms = self.description["actions"]["terms"]
         self._action_clip = self.description["actions"]["clip"]
         terms = self.description["observations"]["terms"]
@@ -136,7 +137,7 @@ class Policy:
         """Return joint torques [N m] for actions of :meth:`act`, clipped to the limits. Shape: (joints,).
 
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
-        ``policy.yaml`` are left out: a robot has them. Gains of a ``drive`` among them must be sent to the drives.
+        ``policy.yaml`` are left out: a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
         """
         return np.clip(self.wanted_torques(actions, joint_positions, joint_velocities), *self.torque_limits)
 
@@ -155,7 +156,7 @@ class Policy:
     def drive_targets(self, actions: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return tau, q, kp and kd of drives that make tau + kp (q - position) - kd velocity. Shapes: (joints,).
 
-        That is :meth:`wanted_torques` of actions, for the terms position_residual and torque.
+        That is :meth:`wanted_torques`, for position_residual and torque, and a ``drive`` of ``policy.yaml``.
         """
         q = self.nominal_pose.astype(float)
         tau, kp, kd = np.zeros((3, len(q)))
@@ -165,7 +166,9 @@ class Policy:
             else:
                 q = self.nominal_pose + term["scale"] * values.astype(float)
                 kp, kd = (term["mixing_weight"] * gain for gain in (self.stiffness, self.damping))
-        return tau, q, kp, kd
+        stiffness, damping = self._drive_gains  # towards the nominal pose
+        q = self.nominal_pose + kp / np.maximum(kp + stiffness, 1e-9) * (q - self.nominal_pose)
+        return tau, q, kp + stiffness, kd + damping
 
     def scan_places(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
         """Return x and y of the points of the height scan in the world, in which the trunk has a pose [m].

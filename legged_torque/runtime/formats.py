@@ -25,6 +25,8 @@ def _read(folder: Path, known_actions: set[str]) -> tuple[dict[str, Any], list[s
     problems += [f"the observation {each['name']}" for each in observations["terms"] if each["name"] not in UNITREE]
     problems += [f"the actions {each['name']}" for each in actions if each["name"] not in known_actions]
     problems += [f"an interval of {each['name']}" for each in actions if each.get("interval", 1) > 1]
+    motors = description.get("motors", {}).items()
+    problems += [f"the gains of the motors' {name}" for name, motor in motors if motor.get("model") == "drive"]
     problems += ["a history of observations"] if observations["history_length"] > 1 else []
     return description, problems + (["a recurrent network"] if "memory" in description["network"] else [])
 

@@ -147,7 +147,7 @@ def test_what_policies_bear(swept):
         f"PD tracks {position.min():.2f} to {position.max():.2f}, the four torque approaches {torque.min():.2f} to "
         in text
     )
-    assert f" to {torque.max():.2f}. Late measurements" in text
+    assert f" to {torque.max():.2f}. - **Pushes**" in text
     masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     costs = masses.iloc[0] - masses.iloc[-1]
     others = costs.drop("a1_position")

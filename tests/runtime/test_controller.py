@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from support.control import JOINTS
+from support.exports import export_random
 from support.simulated import RATE, World
 
 from legged_torque import resource_path
+from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
 from legged_torque.runtime.controller import Controller, Mode
@@ -39,12 +41,18 @@ def random_state(rng, joints=12):
     return RobotState(1, np.array([1.0, 0, 0, 0]), np.zeros(3), q, dq, zeros, zeros, zeros.astype(int))
 
 
-def test_drives_do_what_the_policy_wants(policy):
-    """Feed-forward torques and gains give in any state the torques of the policy's law."""
-    rng = np.random.default_rng(0)
+@pytest.mark.parametrize(("stiffness", "damping"), [(0.0, 0.0), (7.0, 0.5)])
+def test_drives_do_what_the_policy_wants(make_task, tmp_path, stiffness, damping):
+    """Feed-forward torques and gains give in any state the torques of the policy's law and of a drive behind it."""
+    drive = {"motors.chain": ["delay", "drive", "ideal"]}
+    drive |= {"motors.drive.stiffness": {"calf": stiffness, "": 0.0}, "motors.drive.damping": damping}
+    export_random(make_task, "go2_torque_multihead", tmp_path, **drive)
+    policy, rng = Policy(tmp_path), np.random.default_rng(0)
     for _ in range(20):
         actions, state = rng.normal(0.0, 2.0, 24).astype(np.float32), random_state(rng)
         expected = policy.wanted_torques(actions, state.joint_positions, state.joint_velocities)
+        held = stiffness * np.tile([0.0, 0.0, 1.0], 4)
+        expected += held * (policy.nominal_pose - state.joint_positions) - damping * state.joint_velocities
         tau, q, kp, kd = policy.drive_targets(actions)
         command = MotorCommand(tau, q, np.zeros(12), kp, kd)
         np.testing.assert_allclose(torques_of(command, state), expected, rtol=1e-4, atol=1e-4)
