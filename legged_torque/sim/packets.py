@@ -130,7 +130,7 @@ class PacketQueue(Buffers):
             wp.launch(send_packet, queue[0].shape, [sent, other, seeds, *chances, *queue], device=sent.device)
 
     def received(self, elapsed: int) -> Tensor:
-        """Return the packet that has arrived so many physics steps after the newest was sent. Shape: as of it."""
+        """Return, by torch only, what has arrived ``elapsed`` physics steps after the newest was sent. Shape: its."""
         if not self.depth:
             return self.newest
         missing = self.drawn.clamp(0.0, 1.0e6).int() * self.unit_steps - elapsed
