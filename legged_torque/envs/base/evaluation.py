@@ -3,6 +3,7 @@
 import copy
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -26,9 +27,14 @@ class WalkingEvaluation:
         self._metrics = WalkingMetrics(self.task)
 
     def step(self, actions: Tensor) -> TensorDict:
-        """Make a control step, measure it, and return the observations."""
-        commands = self.task.state.commands.clone()
-        obs = self.task.step(actions)[0]
+        """Make a control step, measure it, and return the observations.
+
+        A fall does not put a time-out off: worlds whose robots fall together would go on in step for all training.
+        """
+        task, commands = self.task, self.task.state.commands.clone()
+        age = (task.episode_length_buf + 1) % task.max_episode_length
+        obs, _, dones, extras = task.step(actions)
+        task.episode_length_buf = torch.where(dones & ~extras["time_outs"], age, task.episode_length_buf)
         self._metrics.add_step(commands)
         return obs
 
