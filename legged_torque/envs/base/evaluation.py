@@ -27,12 +27,9 @@ class WalkingEvaluation:
         self._metrics = WalkingMetrics(self.task)
 
     def step(self, actions: Tensor) -> TensorDict:
-        """Make a control step, measure it, and return the observations.
-
-        A fall does not put a time-out off: worlds whose robots fall together would go on in step for all training.
-        """
+        """Make a control step, measure it, and return the observations; a fall does not put a time-out off."""
         task, commands = self.task, self.task.state.commands.clone()
-        age = (task.episode_length_buf + 1) % task.max_episode_length
+        age = (task.episode_length_buf + 1) % task.max_episode_length  # or those who fall together stay in step
         obs, _, dones, extras = task.step(actions)
         task.episode_length_buf = torch.where(dones & ~extras["time_outs"], age, task.episode_length_buf)
         self._metrics.add_step(commands)

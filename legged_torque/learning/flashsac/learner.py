@@ -24,8 +24,8 @@ from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError
 
-CRITIC_NUMBERS = ("critic", "critic_gradient_norm")
-ACTOR_NUMBERS = ("actor", "entropy", "action_std", "actor_gradient_norm")
+NUMBERS: dict[str, tuple[str, ...]] = {"actor": ("actor", "entropy", "action_std", "actor_gradient_norm")}
+NUMBERS |= {"critic": ("critic", "critic_gradient_norm")}
 """What is logged of the gradient steps of critic and actor: means over those that were made."""
 
 
@@ -93,8 +93,7 @@ class FlashSAC:
         self._skip = torch.zeros((), device=device)
         for optimizer in self.optimizers.values():
             optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where it is 1, a fused optimizer skips
-        numbers = {"actor": ACTOR_NUMBERS, "critic": CRITIC_NUMBERS}
-        self._sums = {name: torch.zeros(len(names) + 1, device=device) for name, names in numbers.items()}
+        self._sums = {name: torch.zeros(len(names) + 1, device=device) for name, names in NUMBERS.items()}
         self._acts_at_random = torch.ones((), dtype=torch.bool, device=device)
         self.num_updates = 0
         steps = {learns: functools.partial(self.take_gradient_step, learns) for learns in (True, False)}
@@ -170,8 +169,7 @@ class FlashSAC:
         """Take ``updates_per_step`` gradient steps for each control step of the rollout.
 
         Returns:
-            :data:`CRITIC_NUMBERS`, :data:`ACTOR_NUMBERS`, "temperature", "reward_scale", "learning_rate",
-            "skipped_updates" and "all_skipped", see :class:`~legged_torque.learning.protocols.Learner`.
+            Means of :data:`NUMBERS`, "temperature", "reward_scale", "learning_rate", "skipped_updates", "all_skipped".
         """
         for sums in self._sums.values():
             sums.zero_()
@@ -185,7 +183,7 @@ class FlashSAC:
         numbers = {"temperature": float(self.log_temperature.detach().exp())}  # here the host waits for the first time
         numbers |= {"reward_scale": float(self.reward_scale.scale()), "learning_rate": float(self.learning_rate)}
         skipped = 0.0
-        for name, names in (("actor", ACTOR_NUMBERS), ("critic", CRITIC_NUMBERS)):
+        for name, names in NUMBERS.items():
             *totals, kept = self._sums[name].tolist()
             skipped += made[name] - kept
             if kept:
@@ -225,7 +223,7 @@ class FlashSAC:
         return Batch(obs, actions, rewards, discounts, next_obs, weights)
 
     def actor_loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Return the loss of actor and temperature, and the first of :data:`ACTOR_NUMBERS`.
+        """Return the loss of actor and temperature, and the first of its :data:`NUMBERS`.
 
         The actor is to earn much by the lower critic and to be random; the temperature falls while the entropy is
         above its target, that of a normal distribution of ``temp_target_sigma``. The normalizations see the following
