@@ -157,6 +157,59 @@ def test_what_policies_bear(swept):
             assert f"{energy.min():.3f} to {energy.max():.3f}" in text
 
 
+def test_low_again():
+    """Means and standard errors of seeds, and what torque multi-head saves."""
+    data = pd.read_csv(DOCS / "results" / "low.csv.gz").groupby(["task", "seed"]).mean().groupby("task")
+    metrics = ["track_percentage", "track_xy", "track_angular", "cost_of_transport"]
+    _, rows = rows_of("results.md", "method | seeds")
+    assert len(rows) == 7
+    for method, seeds, *cells in rows:
+        means, errors = (of.loc[TASKS[method]] for of in (data.mean(), data.sem()))
+        assert int(seeds) == data.size()[TASKS[method]]
+        for cell, metric in zip(cells, metrics, strict=True):
+            mean, error = cell.split(" ± ")
+            assert same(mean, means[metric]) and same(error, errors[metric]), (method, metric)
+    costs = data.mean()["cost_of_transport"] / data.mean()["cost_of_transport"]["a1_position"]
+    text = text_of("results.md", "## `low` again")
+    assert f"torque multi-head needs {1 - costs['a1_torque_multihead']:.0%} less than PD" in text
+    more = [f"{costs[f'a1_torque_curriculum{name}'] - 1:.0%}" for name in ("", "_multihead")]
+    assert f"the curriculum needs {more[0]} and the combination {more[1]} more" in text
+
+
+def test_learners():
+    """Million steps to 50 and 70% and tracking at the end, lowest and highest of the seeds that came so far."""
+    data = pd.read_csv(DOCS / "results" / "learners.csv.gz")
+    data = data[data["total"] != 12_000_000]  # those of docs/tried.md
+    _, rows = rows_of("howto/learner.md", "task | 50%: PPO")
+    assert len(rows) == 6
+    for task, *cells in rows:
+        for number, cell in enumerate(cells):
+            learner = ("PPO", "PPO, 128 worlds", "FlashSAC")[number % 3]
+            runs = [
+                run for _, run in data[(data["task"] == task.strip("`")) & (data["learner"] == learner)].groupby("seed")
+            ]
+            assert len(runs) == 4
+            if number < 6:
+                reached = [run[run["track_percentage"] >= (0.5, 0.7)[number // 3]]["steps"].min() / 1e6 for run in runs]
+                texts = [f"{steps:.0f}" for steps in sorted(steps for steps in reached if steps > 0)]
+            else:
+                ended = [run for run in runs if run["steps"].max() > 0.97 * run["total"].max()]
+                tails = [run[run["steps"] > 0.9 * run["total"]]["track_percentage"].mean() for run in ended]
+                texts = [f"{value:.2f}" for value in sorted(tails)]
+            said = "–".join(dict.fromkeys((texts[0], texts[-1]))) if texts else "–"
+            assert cell == said + (f" ({len(texts)})" if 0 < len(texts) < 4 else ""), (task, number)
+
+
+def test_students():
+    """Shares of tiles that teachers and students cross."""
+    data = pd.read_csv(DOCS / "results" / "students.csv.gz").groupby(["policy", "kind", "robot"])["crossed"].mean()
+    crossed, text = data.groupby(["policy", "robot"]).mean(), text_of("howto/learner.md", "## Students")
+    assert "Teachers cross {:.2f} and {:.2f} of".format(*crossed["teacher"]) in text
+    assert {f"{share:.2f}" for share in crossed["student"]} == {"0.72"} and "students 0.72" in text
+    assert "{:.2f} and {:.2f} instead of 1.00 of the stairs up".format(*data["student", "stairs_up"]) in text
+    assert "{:.2f} and {:.2f} instead of 0.93 of the obstacles".format(*data["student", "discrete_obstacles"]) in text
+
+
 def test_sweeps():
     """What is said of the latency of bundled policies."""
     data = pd.read_csv(DOCS / "results" / "sweeps.csv.gz").set_index(["parameter", "metric", "from", "task"])["mean"]

@@ -43,5 +43,5 @@ def preset() -> dict[str, dict[str, Any]]:
     """Return the changes that choose FlashSAC as published, but with an update after 8 control steps, not 1."""
     runner = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
     worlds = {"num_envs": 1024, "num_envs_cpu": 1024}
-    rewards = {"only_positive_rewards": False}  # clipped at 0 they let robots stand still, see docs/tried.md
+    rewards = {"only_positive_rewards": False}  # best of five settings, see docs/tried.md
     return {"env": worlds, "rewards": rewards, "runner": runner, "algorithm": {"class_name": FLASHSAC, "gamma": 0.99}}
