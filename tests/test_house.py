@@ -23,24 +23,24 @@ LEVELS = [
 LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVELS) for part in level}
 MAX_LINES = 400  # of a file
 LINES = {
-    "legged_torque/benchmark": 230,
+    "legged_torque/benchmark": 223,
     "legged_torque/deploy": 1523,
     "legged_torque/envs": 5255,
     "legged_torque/experiments": 1085,
-    "legged_torque/identification": 420,
-    "legged_torque/importer": 1260,
-    "legged_torque/learning": 3920,
-    "legged_torque/motors": 1510,
+    "legged_torque/identification": 415,
+    "legged_torque/importer": 1252,
+    "legged_torque/learning": 3910,
+    "legged_torque/motors": 1505,
     "legged_torque/runtime": 2050,
     "legged_torque/sensors": 302,
-    "legged_torque/sim": 5745,
-    "legged_torque/terrain": 600,
-    "legged_torque/utils": 3215,
+    "legged_torque/sim": 5741,
+    "legged_torque/terrain": 591,
+    "legged_torque/utils": 3209,
     "legged_torque/viewer": 2490,
     "scripts": 2045,
-    "paper": 3055,
-    "tools": 660,
-    "tests": 23_315,
+    "paper": 3048,
+    "tools": 656,
+    "tests": 23_380,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 31_630  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
