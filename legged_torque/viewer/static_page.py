@@ -42,7 +42,7 @@ PACKAGES = {
 """Packages of the npm registry, their sha512, and the files that the page needs; of licences Apache-2.0 and MIT."""
 REGISTRY = "https://registry.npmjs.org/"
 OBSERVATIONS = ("projected_gravity", "angular_velocity", "command", "joint_position", "joint_velocity", "last_action")
-ACTIONS, MOTORS = ("position_residual", "torque"), ("ideal", "curve", "friction")
+ACTIONS, MOTORS = ("position_residual", "torque"), ("ideal", "drive", "curve", "friction")
 """What the page can compute: terms of observations and actions, and models of motors."""
 
 
@@ -63,7 +63,7 @@ def check(policy: Policy) -> None:
 def write_page(folder: Path, policy: Policy, title: str) -> list[str]:
     """Add the page to the folder of an export, and return what it does otherwise than the training.
 
-    It has the robot of the training on a plane, with its limits and torque-speed curves, and no latency. A UserError if
+    It has the robot of the training on a plane, with its motors, and no latency. A UserError if
     the libraries cannot be had, which are downloaded once.
     """
     check(policy)
@@ -97,10 +97,10 @@ def differences(description: dict[str, Any]) -> list[str]:
 
 
 def motors(description: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return models of motors with their constants by joint, but for ideal ones: their limits always hold."""
+    """Return models of motors in their order, with their constants by joint; limits alone if there are none."""
     names, dt = description["joint_order"], 1.0 / description["timing"]["physics_frequency"]
-    links = {f"motors.{link}": each for link, each in description.get("motors", {}).items() if each["model"] != "ideal"}
-    values = [{"model": each["model"]} | constants(each, names, path, dt) for path, each in links.items()]
+    links = description.get("motors") or {"ideal": {"model": "ideal"}}
+    values = [{"model": each["model"]} | constants(each, names, f"motors.{link}", dt) for link, each in links.items()]
     return [{name: np.asarray(value).tolist() for name, value in motor.items()} for motor in values]
 
 

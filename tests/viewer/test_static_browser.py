@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import http.server
+import json
 import threading
 
 import numpy as np
@@ -17,9 +18,11 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.utils import devices
+from legged_torque.viewer import static_page
 
 pytestmark = pytest.mark.timeout(300)  # [s]
 POLICIES = ("go2/torque_multihead", "g1/position")  # with a torque-speed curve; with position control and friction
+DRIVE = {"drive": {"model": "drive", "damping": 0.2, "stiffness": 1.0}}
 STEPS = 25
 RUN = """
 const [steps, done] = arguments;
@@ -35,12 +38,15 @@ const { simulation } = window;
 
 @pytest.fixture(scope="module", params=POLICIES)
 def served(request, tmp_path_factory):
-    """Name of a policy and address of its page."""
+    """Name of a policy and address of its page; drives of the first one close a loop of their own."""
     root = tmp_path_factory.mktemp("site")
     out = root / "published"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
         assert run_here("publish.py", request.param, root=root)[0] == 0
+    page = json.loads((out / "page.json").read_text())
+    page["motors"] = static_page.motors(description(request.param))
+    (out / "page.json").write_text(json.dumps(page))
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=out)
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -54,11 +60,17 @@ def status(browser):
     return browser.find_element(By.ID, "status").text
 
 
+def description(name):
+    """Of a policy, with :data:`DRIVE` for the first one."""
+    found = Policy(name).description
+    return found | {"motors": DRIVE | found["motors"]} if name == POLICIES[0] else found
+
+
 def in_mujoco(name, steps):
     """Positions and torques after some control steps from rest, of the page's motors, without latency."""
     policy = Policy(name)
     robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
-    motors, still = MotorTwin(policy.description), np.zeros(len(policy.joint_order))
+    motors, still = MotorTwin(description(name)), np.zeros(len(policy.joint_order))
     start = np.array(policy.description["initial_state"]["trunk_position"])
     robot.reset(start, np.array([1.0, 0.0, 0.0, 0.0]), policy.nominal_pose, (np.zeros(3), np.zeros(3), still))
     for _ in range(steps):

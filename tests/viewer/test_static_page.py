@@ -21,7 +21,7 @@ def test_refused():
     changed["observations"]["history_length"] = 2
     changed["observations"]["terms"].append({"name": "height_scan"})
     changed["actions"]["terms"][0] |= {"interval": 4}
-    changed["motors"]["heat"] = {"model": "thermal"}
+    changed["motors"] |= {"drive": {"model": "drive"}, "heat": {"model": "thermal"}}
     with pytest.raises(UserError, match=r"the observation height_scan.*interval of position_res.*motor heat.*history"):
         static_page.check(SimpleNamespace(description=changed))
 

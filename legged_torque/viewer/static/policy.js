@@ -21,12 +21,15 @@ const ACTIONS = {
 
 /** Returns the torque that a motor makes of the one asked for, by its model; see legged_torque/motors/formulas.py. */
 const MOTORS = {
-  curve: (motor, i, torque, qd) => {
+  ideal: (policy, motor, i, torque) => clip(torque, ...policy.torqueLimits[i]),
+  drive: (policy, motor, i, torque, q, qd) =>
+    torque + motor.stiffness[i] * (policy.nominalPose[i] - q) - motor.damping[i] * qd,
+  curve: (policy, motor, i, torque, q, qd) => {
     const share = (motor.no_load_speed[i] - Math.abs(qd)) / Math.max(motor.no_load_speed[i] - motor.knee_speed[i], 1e-9);
     const most = torque * qd > 0 ? motor.driving_torque[i] * clip(share, 0, 1) : motor.braking_torque[i];
     return clip(torque, -most, most);
   },
-  friction: (motor, i, torque, qd) => {
+  friction: (policy, motor, i, torque, q, qd) => {
     const fading = Math.exp(-((qd / motor.stribeck_speed[i]) ** 2));
     const [held, moving] = [motor.static_friction[i], motor.coulomb_friction[i]];
     const dry = moving + motor.load_friction[i] * Math.abs(torque) + (held - moving) * fading;
@@ -86,8 +89,10 @@ export class Policy {
         const scaled = scale * actions[term * this.joints.length + i];
         torque += weight * ACTIONS[name](this, i, scaled, qpos[i], qvel[i]);
       });
-      torque = clip(torque, ...this.torqueLimits[i]);
-      return this.motors.reduce((made, motor) => MOTORS[motor.model](motor, i, made, qvel[i]), torque);
+      return this.motors.reduce(
+        (made, motor) => MOTORS[motor.model](this, motor, i, made, qpos[i], qvel[i]),
+        torque,
+      );
     });
   }
 }
