@@ -25,8 +25,8 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 223,
     "legged_torque/deploy": 1523,
-    "legged_torque/envs": 5255,
-    "legged_torque/experiments": 1085,
+    "legged_torque/envs": 5252,
+    "legged_torque/experiments": 1084,
     "legged_torque/identification": 415,
     "legged_torque/importer": 1252,
     "legged_torque/learning": 3910,
@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2045,
     "paper": 3048,
     "tools": 656,
-    "tests": 23_380,
+    "tests": 23_384,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 31_630  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder

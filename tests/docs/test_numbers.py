@@ -16,15 +16,9 @@ TASKS = {
     "curriculum, torque multi-head": "a1_torque_curriculum_multihead",
 }
 ROUGH = {name: task.replace("a1_", "a1_rough_") for name, task in TASKS.items()}
-KINDS = {
-    "slopes, waves, flat": ["flat", "smooth_slope_up", "smooth_slope_down", "rough_slope", "waves"],
-    "stairs up": ["stairs_up"],
-    "stairs down": ["stairs_down"],
-    "obstacles": ["discrete_obstacles"],
-    "stepping stones": ["stepping_stones"],
-    "gaps": ["gaps"],
-    "pits": ["pits"],
-}
+KINDS = {name: [name.replace(" ", "_")] for name in ("stairs up", "stairs down", "stepping stones", "gaps", "pits")}
+KINDS |= {"obstacles": ["discrete_obstacles"]}
+KINDS |= {"slopes, waves, flat": ["flat", "smooth_slope_up", "smooth_slope_down", "rough_slope", "waves"]}
 
 
 def text_of(page, heading):
@@ -116,8 +110,10 @@ def test_cures_of_latency(swept):
     """Lowest and highest seed by latency and training, and of falls after pushes."""
     trained = {"10 ms": "late by 0 to 10 ms", "30 ms": "late by 0 to 30 ms", "10 ms, damping": "damping on the drive"}
     trained |= {"30 ms, damping": "late by 0 to 30 ms, damping on the drive", "10 ms, 200 Hz": "policy at 200 Hz"}
-    columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
-    columns.append(("push_velocity", "fell", 3.5))
+    columns = [
+        *(("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)),
+        ("push_velocity", "fell", 3.5),
+    ]
     _, rows = rows_of("results.md", "policy, latest actions in training")
     assert len(rows) == 11
     for policy, *cells in rows:
@@ -142,11 +138,8 @@ def test_what_policies_bear(swept):
     assert words.format(*pushed[[f"a1_{name}" for name in names]]) in text
     late = base.loc["action_delay", "track_percentage", 6.0]
     position, torque = late["a1_position"], late.drop("a1_position")
-    assert (
-        f"PD tracks {position.min():.2f} to {position.max():.2f}, the four torque approaches {torque.min():.2f} to "
-        in text
-    )
-    assert f" to {torque.max():.2f}. - **Pushes**" in text
+    assert f"PD tracks {position.min():.2f} to {position.max():.2f}, the four torque approaches" in text
+    assert f"approaches {torque.min():.2f} to {torque.max():.2f}. - **Pushes**" in text
     masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     costs = masses.iloc[0] - masses.iloc[-1]
     others = costs.drop("a1_position")
@@ -185,9 +178,8 @@ def test_learners():
     for task, *cells in rows:
         for number, cell in enumerate(cells):
             learner = ("PPO", "PPO, 128 worlds", "FlashSAC")[number % 3]
-            runs = [
-                run for _, run in data[(data["task"] == task.strip("`")) & (data["learner"] == learner)].groupby("seed")
-            ]
+            chosen = data[(data["task"] == task.strip("`")) & (data["learner"] == learner)]
+            runs = [run for _, run in chosen.groupby("seed")]
             assert len(runs) == 4
             if number < 6:
                 reached = [run[run["track_percentage"] >= (0.5, 0.7)[number // 3]]["steps"].min() / 1e6 for run in runs]
