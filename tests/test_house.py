@@ -25,22 +25,22 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 223,
     "legged_torque/deploy": 1523,
-    "legged_torque/envs": 5252,
-    "legged_torque/experiments": 1084,
+    "legged_torque/envs": 5251,
+    "legged_torque/experiments": 1083,
     "legged_torque/identification": 415,
     "legged_torque/importer": 1252,
     "legged_torque/learning": 3910,
     "legged_torque/motors": 1505,
-    "legged_torque/runtime": 2050,
+    "legged_torque/runtime": 2047,
     "legged_torque/sensors": 302,
     "legged_torque/sim": 5741,
     "legged_torque/terrain": 591,
     "legged_torque/utils": 3209,
-    "legged_torque/viewer": 2490,
+    "legged_torque/viewer": 2487,
     "scripts": 2045,
     "paper": 3048,
     "tools": 656,
-    "tests": 23_384,
+    "tests": 23_393,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 31_630  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder

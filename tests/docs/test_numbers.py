@@ -180,7 +180,6 @@ def test_learners():
             learner = ("PPO", "PPO, 128 worlds", "FlashSAC")[number % 3]
             chosen = data[(data["task"] == task.strip("`")) & (data["learner"] == learner)]
             runs = [run for _, run in chosen.groupby("seed")]
-            assert len(runs) == 4
             if number < 6:
                 reached = [run[run["track_percentage"] >= (0.5, 0.7)[number // 3]]["steps"].min() / 1e6 for run in runs]
                 texts = [f"{steps:.0f}" for steps in sorted(steps for steps in reached if steps > 0)]
@@ -198,8 +197,8 @@ def test_students():
     crossed, text = data.groupby(["policy", "robot"]).mean(), text_of("howto/learner.md", "## Students")
     assert "Teachers cross {:.2f} and {:.2f} of".format(*crossed["teacher"]) in text
     assert {f"{share:.2f}" for share in crossed["student"]} == {"0.72"} and "students 0.72" in text
-    assert "{:.2f} and {:.2f} instead of 1.00 of the stairs up".format(*data["student", "stairs_up"]) in text
-    assert "{:.2f} and {:.2f} instead of 0.93 of the obstacles".format(*data["student", "discrete_obstacles"]) in text
+    stairs = data.xs("stairs_up", level="kind")
+    assert "of stairs up {:.2f}, {:.2f} and {:.2f}".format(stairs["teacher", "a1"], *stairs["student"]) in text
 
 
 def test_sweeps():

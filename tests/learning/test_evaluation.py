@@ -107,14 +107,16 @@ def test_what_a_row_says(make_runner, noted, samples, most, worlds, count):
 
 
 def test_falls_do_not_synchronize_worlds(make_task):
-    """Trunks in the ground end each episode; their worlds time out as if they had not."""
+    """Worlds with trunks in the ground, whose episodes end at once, time out like those with robots in the air."""
     evaluation = make_task("a1_torque", 1, **{"env.episode_length_s": 0.1}).make_evaluation(5, "none")
     task = evaluation.task  # an episode has five steps
     task.episode_length_buf = torch.arange(5)
     for step in range(1, 12):
         task.sim.qpos[:] = torch.tensor([0, 0, 0.03, 1.0, 0, 0, 0, *[0.0, 0.8, -2.6] * 4])
+        task.sim.qpos[3:, 2] = 2.0
         evaluation.step(torch.zeros(5, 12))
-        assert task.state.reset_buf.all() and (task.base_pos[:, 2] > 0.2).all()
+        assert task.state.reset_buf[:3].all() and (task.base_pos[:, 2] > 0.2).all()
+        assert task.state.reset_buf[3:].tolist() == [(world + step) % 5 == 0 for world in (3, 4)]
         assert task.episode_length_buf.tolist() == [(world + step) % 5 for world in range(5)]
 
 

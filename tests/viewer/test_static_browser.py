@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import http.server
-import json
 import threading
 
 import numpy as np
@@ -22,15 +21,22 @@ from legged_torque.viewer import static_page
 
 pytestmark = pytest.mark.timeout(300)  # [s]
 POLICIES = ("go2/torque_multihead", "g1/position")  # with a torque-speed curve; with position control and friction
-DRIVE = {"drive": {"model": "drive", "damping": 0.2, "stiffness": 1.0}}
+DRIVE = {"drive": {"model": "drive", "damping": 0.5, "stiffness": 200.0}}
+"""A motor that asks for more than the limits, before them."""
 STEPS = 25
 RUN = """
-const [steps, done] = arguments;
+const [steps, motors, holds, done] = arguments;
 const { simulation } = window;
+const { policy } = simulation;
+const [usual, refresh] = [policy.motors, policy.timing.refresh_torques];
 (async () => {
+  policy.motors = motors;
+  policy.timing.refresh_torques = !holds;
   simulation.reset();
   simulation.command = [0.5, 0.1, -0.2];
   for (let i = 0; i < steps; i++) await simulation.step();
+  policy.motors = usual;
+  policy.timing.refresh_torques = refresh;
   done([Array.from(simulation.robot.data.qpos), simulation.torques]);
 })();
 """
@@ -38,15 +44,12 @@ const { simulation } = window;
 
 @pytest.fixture(scope="module", params=POLICIES)
 def served(request, tmp_path_factory):
-    """Name of a policy and address of its page; drives of the first one close a loop of their own."""
+    """Name of a policy and address of its page."""
     root = tmp_path_factory.mktemp("site")
     out = root / "published"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
         assert run_here("publish.py", request.param, root=root)[0] == 0
-    page = json.loads((out / "page.json").read_text())
-    page["motors"] = static_page.motors(description(request.param))
-    (out / "page.json").write_text(json.dumps(page))
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=out)
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -61,13 +64,13 @@ def status(browser):
 
 
 def description(name):
-    """Of a policy, with :data:`DRIVE` for the first one."""
+    """Of a policy, with :data:`DRIVE` before the motors of the first one."""
     found = Policy(name).description
     return found | {"motors": DRIVE | found["motors"]} if name == POLICIES[0] else found
 
 
 def in_mujoco(name, steps):
-    """Positions and torques after some control steps from rest, of the page's motors, without latency."""
+    """Positions and torques after steps from rest, with one wanted torque each of the first policy; without latency."""
     policy = Policy(name)
     robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
     motors, still = MotorTwin(description(name)), np.zeros(len(policy.joint_order))
@@ -76,9 +79,11 @@ def in_mujoco(name, steps):
     for _ in range(steps):
         actions = policy.act(policy.observation(robot.state(), np.array([0.5, 0.1, -0.2])))
         motors.begin()
-        for _ in range(policy.description["timing"]["decimation"]):
+        for i in range(policy.description["timing"]["decimation"]):
             pos, vel = robot.joint_positions(), robot.joint_velocities()
-            torques = motors.apply(policy.wanted_torques(actions, pos, vel), pos, vel)
+            if i == 0 or name != POLICIES[0]:
+                wanted = policy.wanted_torques(actions, pos, vel)
+            torques = motors.apply(wanted, pos, vel)
             robot.step(torques)
     return robot.data.qpos, torques
 
@@ -89,7 +94,8 @@ def test_page(browser, served):
     browser.get(address)
     wait(lambda: "real time" in status(browser), 60.0)
     browser.find_element(By.ID, "pause").click()
-    qpos, torques = browser.execute_async_script(RUN, STEPS)
+    motors = static_page.motors(description(name))
+    qpos, torques = browser.execute_async_script(RUN, STEPS, motors, name == POLICIES[0])
     expected = in_mujoco(name, STEPS)
     np.testing.assert_allclose(qpos, expected[0], atol=1e-4)
     np.testing.assert_allclose(torques, expected[1], atol=1e-2)

@@ -22,7 +22,9 @@ def test_refused():
     changed["observations"]["terms"].append({"name": "height_scan"})
     changed["actions"]["terms"][0] |= {"interval": 4}
     changed["motors"] |= {"drive": {"model": "drive"}, "heat": {"model": "thermal"}}
-    with pytest.raises(UserError, match=r"the observation height_scan.*interval of position_res.*motor heat.*history"):
+    with pytest.raises(
+        UserError, match=r"the observation height.*interval of position_residual; the motor heat.*history"
+    ):
         static_page.check(SimpleNamespace(description=changed))
 
 

@@ -3,7 +3,6 @@
 import copy
 from typing import Any
 
-import torch
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -27,11 +26,11 @@ class WalkingEvaluation:
         self._metrics = WalkingMetrics(self.task)
 
     def step(self, actions: Tensor) -> TensorDict:
-        """Make a control step, measure it, and return the observations; a fall does not put a time-out off."""
+        """Make a control step, measure it, and return the observations; after a fall, an episode's age goes on."""
         task, commands = self.task, self.task.state.commands.clone()
-        age = (task.episode_length_buf + 1) % task.max_episode_length  # or those who fall together stay in step
-        obs, _, dones, extras = task.step(actions)
-        task.episode_length_buf = torch.where(dones & ~extras["time_outs"], age, task.episode_length_buf)
+        age = (task.episode_length_buf + 1) % task.max_episode_length
+        obs = task.step(actions)[0]
+        task.episode_length_buf = age  # or worlds whose robots fall together would time out together
         self._metrics.add_step(commands)
         return obs
 

@@ -27,7 +27,7 @@ class FlashSACCfg(Section):
     actor_noise_zeta_mu: Positive = 2.0  # noise is repeated for n steps with a probability in proportion to n^-mu
     actor_noise_zeta_max: Annotated[int, Limits(1, 1e6)] = 16  # the largest n
     normalized_g_max: Positive = 5.0  # largest return that the critic knows, in units of scaled rewards
-    action_bound: Positive = 2.0  # largest action, in units of control.action_scale and torque_scale; ours, not tuned
+    action_bound: Positive = 2.0  # largest action, in units of control.action_scale and torque_scale; ours
 
     class actor:  # the policy's network
         hidden_dim: Annotated[int, Limits(1, 1e6)] = 128  # size of its features
@@ -43,5 +43,5 @@ def preset() -> dict[str, dict[str, Any]]:
     """Return the changes that choose FlashSAC as published, but with an update after 8 control steps, not 1."""
     runner = {"num_steps_per_env": 8, "total_steps": 50_000_000, "save_interval": 500}
     worlds = {"num_envs": 1024, "num_envs_cpu": 1024}
-    rewards = {"only_positive_rewards": False}  # best of five settings, see docs/tried.md
+    rewards = {"only_positive_rewards": False}  # better for quadrupeds, see docs/tried.md
     return {"env": worlds, "rewards": rewards, "runner": runner, "algorithm": {"class_name": FLASHSAC, "gamma": 0.99}}

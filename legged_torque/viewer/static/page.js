@@ -36,10 +36,11 @@ export class Simulation {
   async step() {
     const { robot, policy } = this;
     const actions = await policy.act(policy.observation(robot.state(), this.command));
+    let wanted;
     for (let i = 0; i < policy.timing.decimation; i++) {
-      if (i === 0 || policy.timing.refresh_torques) {
-        this.torques = policy.torques(actions, robot.positions(), robot.velocities());
-      }
+      const [qpos, qvel] = [robot.positions(), robot.velocities()];
+      if (i === 0 || policy.timing.refresh_torques) wanted = policy.wantedTorques(actions, qpos, qvel);
+      this.torques = policy.applyMotors(wanted, qpos, qvel);
       robot.step(this.torques);
     }
     this.time += 1 / policy.timing.control_frequency;

@@ -25,7 +25,7 @@ const MOTORS = {
   drive: (policy, motor, i, torque, q, qd) =>
     torque + motor.stiffness[i] * (policy.nominalPose[i] - q) - motor.damping[i] * qd,
   curve: (policy, motor, i, torque, q, qd) => {
-    const share = (motor.no_load_speed[i] - Math.abs(qd)) / Math.max(motor.no_load_speed[i] - motor.knee_speed[i], 1e-9);
+    const share = (motor.no_load_speed[i] - Math.abs(qd)) / Math.max(motor.no_load_speed[i] - motor.knee_speed[i], 1e-6);
     const most = torque * qd > 0 ? motor.driving_torque[i] * clip(share, 0, 1) : motor.braking_torque[i];
     return clip(torque, -most, most);
   },
@@ -37,7 +37,7 @@ const MOTORS = {
   },
 };
 
-/** Runs a policy: observation() and act() once per control step, torques() at every physics step. */
+/** Runs a policy: observation() and act() once per control step, applyMotors() at every physics step. */
 export class Policy {
   /** Takes the contents of page.json and a session of onnxruntime-web, whose class Tensor it needs. */
   constructor(page, session, Tensor) {
@@ -81,18 +81,22 @@ export class Policy {
     return this.lastAction;
   }
 
-  /** Returns what the motors make of actions at joint positions [rad] and velocities [rad/s]: torques [N m]. */
-  torques(actions, qpos, qvel) {
+  /** Returns the torques that actions ask for at joint positions [rad] and velocities [rad/s] [N m]. */
+  wantedTorques(actions, qpos, qvel) {
     return this.joints.map((_, i) => {
       let torque = 0;
       this.actions.terms.forEach(({ name, scale, mixing_weight: weight }, term) => {
         const scaled = scale * actions[term * this.joints.length + i];
         torque += weight * ACTIONS[name](this, i, scaled, qpos[i], qvel[i]);
       });
-      return this.motors.reduce(
-        (made, motor) => MOTORS[motor.model](this, motor, i, made, qpos[i], qvel[i]),
-        torque,
-      );
+      return torque;
     });
+  }
+
+  /** Returns what the motors make of torques that are asked for [N m]. */
+  applyMotors(torques, qpos, qvel) {
+    return torques.map((wanted, i) =>
+      this.motors.reduce((made, motor) => MOTORS[motor.model](this, motor, i, made, qpos[i], qvel[i]), wanted),
+    );
   }
 }
