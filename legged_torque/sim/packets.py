@@ -130,7 +130,7 @@ class PacketQueue(Buffers):
             wp.launch(send_packet, queue[0].shape, [sent, other, seeds, *chances, *queue], device=sent.device)
 
     def received(self, elapsed: int) -> Tensor:
-        """Return, by torch only, what has arrived ``elapsed`` physics steps after the newest was sent. Shape: its."""
+        """Return by torch what has arrived ``elapsed`` steps after the newest was sent. Shape: (num_envs, width)."""
         if not self.depth:
             return self.newest
         missing = self.drawn.clamp(0.0, 1.0e6).int() * self.unit_steps - elapsed

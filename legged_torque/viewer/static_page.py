@@ -63,8 +63,8 @@ def check(policy: Policy) -> None:
 def write_page(folder: Path, policy: Policy, title: str) -> list[str]:
     """Add the page to the folder of an export, and return what it does otherwise than the training.
 
-    It has the robot of the training on a plane, with its motors, and no latency. A UserError if
-    the libraries cannot be had, which are downloaded once.
+    It has the robot of the training on a plane, with its motors, and no latency. A UserError if the libraries cannot be
+    had, which are downloaded once.
     """
     check(policy)
     description = policy.description

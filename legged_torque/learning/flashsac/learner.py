@@ -24,8 +24,8 @@ from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils.errors import UserError
 
-NUMBERS: dict[str, tuple[str, ...]] = {"actor": ("actor", "entropy", "action_std", "actor_gradient_norm")}
-NUMBERS |= {"critic": ("critic", "critic_gradient_norm")}
+OF_ACTOR = ("actor", "entropy", "action_std", "actor_gradient_norm")
+NUMBERS = {"actor": OF_ACTOR, "critic": ("critic", "critic_gradient_norm")}
 """What is logged of the gradient steps of critic and actor: means over those that were made."""
 
 
