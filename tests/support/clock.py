@@ -17,7 +17,7 @@ class Clock:
         self.now += seconds
 
 
-def wait_for(condition, timeout=120.0):
+def wait_for(condition, timeout=150.0):
     """Wait until a condition holds [s], and return its value."""
     end = time.monotonic() + timeout
     while time.monotonic() < end:

@@ -5,6 +5,7 @@ for all tests, and sessions are paused, except where something must move: then n
 """
 
 import contextlib
+import functools
 import io
 import os
 import re
@@ -19,7 +20,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from support.browser import complaints, screen
-from support.clock import wait_for as wait
+from support.clock import wait_for
 from support.scripts import COMMAND, PATHS, run_here
 from support.sessions import new_session, running
 
@@ -30,12 +31,6 @@ from legged_torque.utils.config import flat, to_dict
 from legged_torque.viewer.web import Page
 
 pytestmark = pytest.mark.timeout(900)  # [s]
-TIMEOUT = 150.0  # seconds that the page may take for something; a picture takes 10 on a busy machine
-
-
-def wait_for(condition):
-    """Wait until a condition holds, and return its value."""
-    return wait(condition, TIMEOUT)
 
 
 def walk(session, seconds):
@@ -119,13 +114,19 @@ def type_into(browser, label, value):
     field.send_keys(value, Keys.TAB)
 
 
-def type_until(browser, label, value, condition):
-    """Type a number until a condition holds: a busy page may lose keys."""
+def repeat_until(act, condition):
+    """Do something on the page until a condition holds: a busy page may lose keys and clicks."""
     for _ in range(5):
-        type_into(browser, label, value)
+        act()
         with contextlib.suppress(AssertionError):
-            return wait(condition, TIMEOUT / 5)
-    raise AssertionError(f"'{value}' was typed into '{label}' without effect")
+            return wait_for(condition, 30.0)
+    raise AssertionError("nothing that was done on the page took effect")
+
+
+def set_pause(browser, is_on, condition):
+    """Set the box to pause until a condition holds. The page sets it too, and then a click does the opposite."""
+    box = control(browser, "pause")
+    repeat_until(lambda: box.is_selected() == is_on or click(browser, box), condition)
 
 
 def share(browser, is_meant, left=0.3, right=0.7, top=0.15, bottom=0.8):
@@ -284,7 +285,8 @@ def test_rough_ground(browser, tmp_path):
         open_page(browser, page.server.url)
         wait_for(is_seen)
         assert "discrete_obstacles, level 0 (difficulty 0.20)" in text_of(browser)
-        type_until(browser, "level", "1", lambda: session.task.terrain.levels.tolist() == [1, 1])
+        type_it = functools.partial(type_into, browser, "level", "1")
+        repeat_until(type_it, lambda: session.task.terrain.levels.tolist() == [1, 1])
         walk(session, 0.1)
         wait_for(lambda: "level 1 (difficulty 0.50)" in text_of(browser))
     assert not [message for message in complaints(browser) if "ERR_CONNECTION" not in message]
@@ -303,16 +305,12 @@ def test_a_video_is_downloaded(browser, tmp_path):
             lines = iter(process.stdout.readline, "")
             open_page(browser, next(line for line in lines if "See it walk" in line).split()[3])
             type_into(browser, "speed [x]", "0.1")  # few steps, since the page is slow
-            pause = control(browser, "pause")
-            click(browser, pause)
-            wait_for(lambda: "paused" in text_of(browser))
+            set_pause(browser, True, lambda: "paused" in text_of(browser))
             click(browser, "Record")
             wait_for(lambda: "Stop and download" in text_of(browser))
             start = simulated_time(browser)
-            click(browser, pause)
-            wait_for(lambda: simulated_time(browser) > start + 0.2)
-            click(browser, pause)
-            wait_for(lambda: "paused" in text_of(browser))
+            set_pause(browser, False, lambda: simulated_time(browser) > start + 0.2)
+            set_pause(browser, True, lambda: "paused" in text_of(browser))
             click(browser, "Stop and download")
             file = browser.downloads / "walking.mp4"
             wait_for(file.is_file)
