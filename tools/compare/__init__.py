@@ -1,0 +1,1 @@
+"""Compare this trainer with others on the machine at hand."""
