@@ -1,6 +1,5 @@
 """The code of the how-to pages and the README, run as it stands there."""
 
-import importlib
 import math
 import re
 import runpy
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from support.command import command
+from support.pages import fences, make, python_files, train
 from support.scripts import run_here
 
 from legged_torque.envs import task_registry
@@ -29,53 +29,6 @@ TINY = ["--device=cpu", "--num_envs=2", "--max_iterations=2", "--set=runner.num_
 """Options that make the trainings of a page short."""
 YOURS = "yours"
 """Word in the mark of a block whose tasks and files a reader has made."""
-
-
-def python_files(page):
-    """A page's files of Python that are run, a block each: name, given in the first line or made up, and text."""
-    texts = [block for _, mark, language, block in fences(page) if language == "python" and not mark]
-    texts = ["\n".join(texts)] if page == "docs/howto/python.md" else texts  # a program, as it says
-    names = [re.match(r"# (\w+)\.py\n", text) for text in texts]
-    made_up = (f"block_{i}_of_a_page" for i in range(len(texts)))
-    return [(name[1] if name else other, text) for name, other, text in zip(names, made_up, texts, strict=True)]
-
-
-@pytest.fixture
-def run_page(monkeypatch, tmp_path):
-    """Import a page's blocks of Python, each a file of its own; tasks and modules are forgotten afterwards."""
-    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-
-    def run(page):
-        names = {}
-        for name, text in python_files(page):
-            (tmp_path / f"{name}.py").write_text(text)
-            monkeypatch.delitem(sys.modules, name, raising=False)
-            names |= vars(importlib.import_module(name))
-            monkeypatch.setitem(sys.modules, name, sys.modules.pop(name))  # taken out again afterwards
-        return names
-
-    return run
-
-
-def make(name, *settings, num_envs=4):
-    """Build a task of a page on the CPU."""
-    torch.manual_seed(0)
-    options = Options(device="cpu", num_envs=num_envs, set=list(settings))
-    return task_registry.make_env(name, options)[0]
-
-
-def train(task, name):
-    """Train a task for two short iterations."""
-    settings = ["runner.num_steps_per_env=4", "evaluation.interval=0", "actor.hidden_dims=[16, 16]"]
-    _, train_cfg = task_registry.get_cfgs(name, Options(device="cpu", set=settings))
-    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
-    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
-    runner.learn(2)
-    after = list(runner.alg.actor.parameters())
-    assert all(torch.isfinite(parameter).all() for parameter in after)
-    assert any(not torch.equal(*pair) for pair in zip(before, after, strict=True))
 
 
 @pytest.mark.parametrize(
@@ -240,14 +193,6 @@ def test_robot(run_page):
     assert (task.base_pos[:, 2] > 0.2).all() and (task.feet_contact.sum(dim=1) > 2).all()
     assert make("minidog_torque").num_actions == 8  # trained is the other task, whose kernels are there
     train(task, "minidog_position")
-
-
-def fences(page):
-    """Each Bash and Python block of a page: line, why it is not run if it is marked so, language, text."""
-    text = (ROOT / page).read_text("utf-8")
-    pattern = r"^(?:<!-- not run: (\S[^\n]*) -->\n)?```(bash|python)\n(.*?)^```"
-    found = re.finditer(pattern, text, flags=re.MULTILINE | re.DOTALL)
-    return [(text.count("\n", 0, match.start(2)) + 1, match[1] or "", match[2], match[3]) for match in found]
 
 
 def script_calls(block):
