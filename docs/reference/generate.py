@@ -117,8 +117,8 @@ Methods that a subclass may override. Call `super()` to keep what the base does.
 NAMES_HEAD = """# Old names
 
 Made by `python docs/reference/generate.py` from `legged_torque/utils/successors.yaml`: names of
-[legged_gym](../howto/migrate.md), and of this library before settings were renamed. A task that uses one is refused in
-these words.
+[legged_gym](../howto/from_legged_gym.md), and of this library before settings were renamed. A task that uses one is
+refused in these words.
 """
 HOOKS = (
     (LeggedRobot, "action_terms"),
