@@ -3,6 +3,7 @@
 Robot, commands, ground, decimation, physics step, networks, epochs and minibatches are the same in all rows. With
 ``equal`` settings, so are the friction cone, impratio and iterations of the solver, and there are no mirror images.
 Different in all rows are rewards, observations, random parameters, gains, learning rates and precision (bfloat16 here).
+Seconds are from the command on; start-up ends with the first iteration, which compiles.
 
 Checkpoints of both walk in plain MuJoCo, each in the model that it was trained with, until one tracks 70% of its
 commands. Isaac Lab is left out since it needs NVIDIA's own index of packages, and MuJoCo Playground 1.0 since it has no

@@ -68,16 +68,16 @@ def tracking(walker: Walker) -> float:
 class Recorder:
     """Notes start and end of each update of rsl_rl's runner; iterations go from end to end."""
 
-    def __init__(self, runner: Any) -> None:
-        """Watch a runner."""
-        self._times: list[tuple[float, float]] = []
+    def __init__(self, runner: Any, started: float) -> None:
+        """Watch a runner; the command was given at ``started``, of time.time()."""
+        self._times: list[tuple[float, float]] = []  # since then [s]
         update = runner.alg.update
 
         def timed(*args: Any, **kwargs: Any) -> Any:
             """Update, and note when."""
-            start = time.perf_counter()
+            start = time.time() - started
             losses = update(*args, **kwargs)
-            self._times.append((start, time.perf_counter()))
+            self._times.append((start, time.time() - started))
             return losses
 
         runner.alg.update = timed
@@ -89,12 +89,12 @@ class Recorder:
         iteration = 1e3 * median(ends[i] - ends[i - 1] for i in counted)
         update = 1e3 * median(ends[i] - starts[i] for i in counted)
         steps_per_s = 1e3 * num_envs * NUM_STEPS / iteration
-        return {"iteration_ms": iteration, "update_ms": update, "training_steps_per_s": steps_per_s}
+        rates = {"iteration_ms": iteration, "update_ms": update, "training_steps_per_s": steps_per_s}
+        return rates | {"start_up_s": self.seconds(1)}
 
     def seconds(self, iterations: int) -> float:
-        """Return the time of some iterations from the first [s]; that one, which compiles, counts as a usual one."""
-        _, ends = np.transpose(self._times)
-        return float(ends[iterations - 1] - ends[0] + np.median(np.diff(ends)))
+        """Return the time from the command to the end of an iteration, counted from 1 [s]."""
+        return self._times[iterations - 1][1]
 
 
 def parse_args() -> argparse.Namespace:

@@ -1,7 +1,6 @@
 """mjlab's side of the comparison: its own Go1 on flat ground; runs in an environment that has mjlab 1.6."""
 
 import importlib.metadata
-import time
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -89,15 +88,14 @@ def main() -> None:
     folder = args.out.parent / "mjlab"
     folder.mkdir(exist_ok=True)
     runner = MjlabOnPolicyRunner(env, agent, str(folder), args.device)
-    built = time.time() - args.started
-    recorder = measure.Recorder(runner)
+    recorder = measure.Recorder(runner, args.started)
     runner.learn(args.iterations, init_at_random_ep_len=True)
     actions = 0.5 * torch.randn(args.num_envs, env.num_actions, device=args.device)
     synchronize = torch.cuda.synchronize if "cuda" in args.device else lambda: None
     step = measure.step_ms(lambda: env.step(actions), synchronize)
     settings = [f"{name}={getattr(cfg.sim.mujoco, name)}" for name in ("timestep", *measure.EQUAL)]
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
-    result = {"settings": settings, "versions": versions, "start_up_s": built, "step_ms": step}
+    result = {"settings": settings, "versions": versions, "step_ms": step}
     result |= recorder.summary(args.num_envs)
     policies = walkers(env.unwrapped, runner, folder)
     measure.write(args.out, result | measure.time_until_enough(recorder, policies, args.num_envs))

@@ -1,6 +1,5 @@
 """Our side of the comparison: ``go1_position`` on a plane in ``low``, without mirror images if settings are equal."""
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -66,12 +65,11 @@ def main() -> None:
     options = Options(num_envs=args.num_envs, seed=args.seed, perturbation="low", set=words)
     cfgs = task_registry.get_cfgs(TASK, options)
     task, runner = build(TASK, cfgs, args.device, str(args.out.parent))
-    built = time.time() - args.started
-    recorder = measure.Recorder(runner)
+    recorder = measure.Recorder(runner, args.started)
     runner.learn(args.iterations, init_at_random_ep_len=True)
     actions = 0.5 * torch.randn(args.num_envs, task.num_actions, device=args.device)
     step = measure.step_ms(lambda: task.step(actions), lambda: wp.synchronize_device(args.device))
-    result = {"settings": words, "versions": package_versions(), "start_up_s": built, "step_ms": step}
+    result = {"settings": words, "versions": package_versions(), "step_ms": step}
     result |= recorder.summary(args.num_envs)
     folder = Path(runner.logger.log_dir)
     measure.write(args.out, result | measure.time_until_enough(recorder, walkers(cfgs, folder, args), args.num_envs))
