@@ -12,7 +12,7 @@ import yaml
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
-from legged_torque.utils.policies import HUB, policy_dir, policy_names
+from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
@@ -29,10 +29,11 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     """
     path = Path(path)
     if not path.exists():
-        if not path.as_posix().startswith(HUB) and path.as_posix() not in policy_names():
-            names = ", ".join(policy_names())
-            raise UserError(f"there is no file or folder '{path}', nor a bundled policy of that name: {names}")
+        if not path.as_posix().startswith((HUB, WANDB)) and path.as_posix() not in policy_names():
+            raise UserError(f"there is no file or folder '{path}', nor a bundled policy: {', '.join(policy_names())}")
         path = policy_dir(path.as_posix())
+        if not (path / DESCRIPTION_FILE).is_file():  # a run of wandb: what export.py has made of it
+            path = max(path.glob("exported_*"), key=lambda export: export.stat().st_mtime, default=path)
     folder, is_network = path if path.is_dir() else path.parent, path.suffix == ".onnx"
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
     network = path if is_network else folder / NETWORK_FILE
@@ -41,7 +42,7 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     try:
         text = file.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}'") from None
+        raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}': export.py makes it") from None
     except (OSError, ValueError) as error:
         raise UserError(f"'{file}' is not valid YAML: {error}") from None
     description = parse_yaml(text, f"'{file}'")
@@ -156,5 +157,4 @@ def require(*packages: str, extra: str = "export") -> None:
     """Raise a UserError that names the extra if a package is not installed."""
     for package in packages:
         if importlib.util.find_spec(package) is None:
-            line = f"pip install 'legged_torque[{extra}]'"
-            raise UserError(f"{package} is not installed; exported policies need the extra: {line}")
+            raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")

@@ -138,9 +138,7 @@ class TrainingEvaluator:
                 obs = evaluation.step(self._acting(obs))
 
 
-def make_evaluators(
-    task: Any, policy: Policy, settings: dict[str, Any], seed: int, capture: bool
-) -> list[TrainingEvaluator]:
+def make_evaluators(task: Any, policy: Policy, settings: dict, seed: int, capture: bool) -> list[TrainingEvaluator]:
     """Return the evaluators of a training, with its settings ``evaluation`` and its seed.
 
     A UserError if an environment is unknown, or the task cannot be evaluated, but shall be.

@@ -124,7 +124,8 @@ class Trainer:
                     self.save_checkpoint()
             self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
-        self._log.stop()
+        if self._log.broken_pipe:
+            raise self._log.broken_pipe
         if guard.problem:
             raise TrainingError(f"training cannot learn: {guard.problem}")
 
@@ -278,7 +279,8 @@ class Trainer:
         self.logger.log_dir = str(claim_run_dir(Path(self.log_dir), config))
 
     def close(self) -> None:
-        """Leave the processes that train together, if there are any; training is over then."""
+        """Close the log, and leave the processes that train together, if there are any; training is over then."""
+        self.logger.stop_logging_writer()
         if torch.distributed.is_initialized():
             self._wait()
             if hasattr(self.alg, "close"):

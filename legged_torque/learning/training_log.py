@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from rsl_rl.utils import LogWriter
 from rsl_rl.utils.logger import Logger
-from rsl_rl.utils.wandb_log_writer import WandbLogWriter
+from rsl_rl.utils.wandb_log_writer import WandbLogWriter, wandb
 
 from legged_torque.learning.checkpoint import last_line
 from legged_torque.learning.protocols import Task
@@ -23,6 +23,7 @@ from legged_torque.utils.devices import device_name
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_errors
+from legged_torque.utils.runs import CONFIG_FILE
 
 _STYLES = re.compile("\033\\[[0-9;]*m")  # escape sequences of bold or colored text
 _NOT_LOSSES = ("learning_rate", "action_std", "all_skipped")  # numbers of a learner that are logged elsewhere, or not
@@ -58,9 +59,7 @@ class TrainingLog:
         walks_after = self._cfg.get("walks_after", 0)
         self.display = TrainingDisplay(title, folder, last, first, steps, is_quiet, walks_after=walks_after)
 
-    def prepare(
-        self, iteration: int, times: dict[str, float], numbers: dict[str, float], measured: dict[str, float]
-    ) -> None:
+    def prepare(self, iteration: int, times: dict[str, float], numbers: dict[str, float], measured: dict) -> None:
         """Read what else there is to log of an iteration from the device, for :meth:`write`.
 
         ``numbers`` are the learner's; ``measured`` are logged by the names that they have.
@@ -105,12 +104,6 @@ class TrainingLog:
         except BrokenPipeError as error:  # `| head`: ends the training like Ctrl-C
             self.broken_pipe = error
 
-    def stop(self) -> None:
-        """Close the writer, and raise :attr:`broken_pipe` if there is one."""
-        self._logger.stop_logging_writer()
-        if self.broken_pipe:
-            raise self.broken_pipe
-
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the returns and lengths of the last episodes, over which the log averages."""
         buffers = {"returns": self._logger.rewbuffer, "lengths": self._logger.lenbuffer}
@@ -133,19 +126,26 @@ class NoLogWriter(LogWriter):
 
 
 class WandbWriter(WandbLogWriter):
-    """rsl_rl's writer, which takes settings only as a dataclass or with a ``to_dict``."""
+    """rsl_rl's writer, with settings and checkpoints such that ``--policy wandb:entity/project/run`` loads them."""
 
     def __init__(self, log_dir: str, project_name: str) -> None:
         """Start a run of wandb; a UserError if that refuses, as it does without a key."""
-        import wandb
-
         try:
             super().__init__(log_dir, project_name)
         except wandb.Error as error:
             raise UserError(f"--logger wandb: {error}") from None
 
     def store_config(self, env_cfg: BaseConfig, train_cfg: dict) -> None:
-        """Upload the settings of task and training."""
-        import wandb
-
+        """Upload the settings of task and training, for wandb's page as values and for us as the run's file."""
         wandb.config.update({"env_cfg": to_dict(env_cfg), "train_cfg": train_cfg})
+        self.save_model(str(Path(self.log_dir, CONFIG_FILE)), 0)
+
+    def save_model(self, model_path: str, it: int) -> None:
+        """Upload a file in a folder of the run's name: at the top, wandb's own config.yaml would overwrite ours."""
+        wandb.save(model_path, base_path=Path(model_path).parents[1])
+
+    def stop(self) -> None:
+        """Upload the videos that were made since the last iteration, and end the run of wandb."""
+        for video in Path(self.log_dir).rglob("*.mp4"):
+            self.save_video(video, None)
+        super().stop()

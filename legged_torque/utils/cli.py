@@ -138,10 +138,8 @@ def add_options(parser: Parser, *names: str) -> None:
             elif hint == list[str]:
                 how["action"] = "append"
             elif hint not in (str, str | None):
-                how |= {
-                    "type": float if hint == Rate | None else int,
-                    "help": f"{how['help']}; {describe(hint).removesuffix(' or null')}",
-                }
+                how["type"] = float if hint == Rate | None else int
+                how["help"] += f"; {describe(hint).removesuffix(' or null')}"
             if name == "task" and "load_run" in names:
                 how |= {"default": "", "help": _TASK_OF_RUN}
             if aliases := how.pop("aliases", ()):

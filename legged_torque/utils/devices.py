@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from legged_torque.utils import distributed
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, counted, unknown_name
 
 COUNTS = Path("/proc/stat")  # Linux's times of the cores
 MEMORY = Path("/proc/meminfo")  # and its memory
@@ -51,8 +51,7 @@ def device_name(device: str) -> str:
 
     if torch.device(device).type == "cuda":
         return torch.cuda.get_device_name(device)
-    threads = torch.get_num_threads()
-    return f"CPU, {threads} thread{'s' if threads > 1 else ''}"
+    return f"CPU, {counted(torch.get_num_threads(), 'thread')}"
 
 
 def free_memory(device: str) -> float:

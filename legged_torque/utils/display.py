@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Callable
 from datetime import timedelta
-from types import TracebackType
 from typing import TYPE_CHECKING, ClassVar, TextIO
 
 from rich.console import Console, Group, RenderableType
@@ -90,9 +89,8 @@ class Display:
     def view(self) -> RenderableType:
         """Return the view for a terminal."""
         self.update_bar()
-        return Group(
-            self.bar.get_renderable(), *(Text(text, "yellow") for text in (self.activity, self.notice) if text)
-        )
+        texts = filter(None, (self.activity, self.notice))
+        return Group(self.bar.get_renderable(), *(Text(text, "yellow") for text in texts))
 
     def line(self) -> str:
         """Return the line that is printed elsewhere."""
@@ -117,9 +115,7 @@ class Display:
             self._live.start(refresh=True)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         """Show the last state if it shall stay, and end."""
         if self._live is not None:
             Display.shown = None

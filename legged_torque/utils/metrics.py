@@ -28,7 +28,6 @@ import numpy as np
 
 Array: TypeAlias = Any  # a numpy array or a torch tensor
 
-
 UNITS = {
     "track_percentage": "share",
     "track_xy": "m^2/s^2",

@@ -38,9 +38,7 @@ class Options:
         "auto",
         aliases=("--sim_device", "--rl_device"),  # of legged_gym, where they may differ
     )
-    num_envs: Worlds | None = _option(
-        "number of worlds, with torchrun those of each process; default: that of the task"
-    )
+    num_envs: Worlds | None = _option("number of worlds, with torchrun of each process; default: that of the task")
     seed: Number | None = _option("random seed; default: that of the training settings")
     preset: str | None = _option(
         "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long), "
@@ -50,9 +48,7 @@ class Options:
         "random parameters, pushes and noise: none, low, high, high_frequency or doubled; default: none, or what a "
         "loaded run has"
     )
-    ranges: str | None = _option(
-        "how far random parameters go: default or hard; default: those of the task, or what a loaded run has"
-    )
+    ranges: str | None = _option("how far random parameters go: default or hard; default: as in the task or loaded run")
     motors: str | None = _option(
         "models of the motors: ideal, real, or another of the robot's motors.choices, or a YAML file of identify.py; "
         "default: those of the task, or what a loaded run has"
@@ -62,11 +58,7 @@ class Options:
     task_file: list[str] = _option(
         "Python file that registers tasks of your own, which runs as your code; may be repeated", [], metavar="FILE"
     )
-    set: list[str] = _option(
-        "change a setting by its dotted path, e.g. rewards.scales.torques=-1e-4; may be repeated",
-        [],
-        metavar="KEY=VALUE",
-    )
+    set: list[str] = _option("change a setting, rewards.scales.torques=-1e-4; may be repeated", [], metavar="KEY=VALUE")
     log_root: str | None = _option("folder that keeps all experiments; default: ./logs")
     experiment_name: str | None = _option("folder of the runs below that; default: name of the task")
     run_name: str | None = _option("added to the name of the run's folder")
@@ -76,9 +68,7 @@ class Options:
     checkpoint: Number | None = _option("checkpoint to load; default, and -1: the last one")
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
-    max_iterations: Count | None = _option(
-        "iterations in all, with those before a resume; default: 110e6 environment steps, on a CPU 15e6"
-    )
+    max_iterations: Count | None = _option("iterations, those before a resume included; default: 110e6 steps, CPU 20e6")
 
     def __post_init__(self) -> None:
         """Take -1 for the last run and the last checkpoint, as legged_gym does."""

@@ -1,20 +1,24 @@
-"""Trained policies that come with the package: run folders below ``resources/policies``, each with a card."""
+"""Trained policies: those of the package in ``resources/policies``, each with a card, and others from servers."""
 
 import contextlib
 import hashlib
+import importlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.files import is_whole_archive
 from legged_torque.utils.plain_yaml import parse_yaml
+from legged_torque.utils.runs import CONFIG_FILE, checkpoint_file
 
 POLICIES_DIR = RESOURCES_DIR / "policies"
 CARD = "card.yaml"
 """What a policy is, how it was made and measured, and the checksums of its files."""
-HUB = "hf:"
-"""Begins the name of a policy that is a model of the Hugging Face Hub: ``hf:owner/name``."""
+HUB, WANDB = "hf:", "wandb:"
+"""Begin the names of models of the Hugging Face Hub, ``hf:owner/name``, and runs, ``wandb:entity/project/run``."""
 
 
 def policy_names() -> list[str]:
@@ -22,11 +26,14 @@ def policy_names() -> list[str]:
     return sorted(file.parent.relative_to(POLICIES_DIR).as_posix() for file in POLICIES_DIR.glob(f"*/*/{CARD}"))
 
 
-def policy_dir(name: str) -> Path:
+def policy_dir(name: str, checkpoint: int | None = None) -> Path:
     """Return the folder of a bundled policy, or a copy of one from the Hub, which scripts take as run and as export.
 
-    A UserError if there is none of this name, or a file is not the one that its card was written for.
+    Of a run of wandb, it is a copy with one checkpoint, by default the last. A UserError if there is none of this name,
+    or a file is not the one that its card was written for.
     """
+    if name.startswith(WANDB):
+        return download_run(name.removeprefix(WANDB), checkpoint)
     if name.startswith(HUB):
         folder = download(name.removeprefix(HUB))
     elif name in policy_names():
@@ -42,26 +49,51 @@ def policy_dir(name: str) -> Path:
 def download(repository: str) -> Path:
     """Return a copy of a model of the Hub, as ``publish.py --push`` has uploaded it; a UserError if there is none."""
     kinds = [CARD, "config.yaml", "policy.onnx", "policy.yaml", "model_*.pt"]
-    with _hub(f"cannot download the policy '{HUB}{repository}'") as hub:
-        return Path(hub.snapshot_download(repository, allow_patterns=kinds))
+    with _client("huggingface_hub", "hub", f"cannot download the policy '{HUB}{repository}'") as client:
+        return Path(client.HfApi().snapshot_download(repository, allow_patterns=kinds))
+
+
+def download_run(path: str, checkpoint: int | None) -> Path:
+    """Return a copy of a run of wandb, ``entity/project/run``, with its settings and a checkpoint, by default the last.
+
+    A UserError if there is none. What WandbWriter has uploaded is in a folder of the run's name.
+    """
+    with _client("wandb", "wandb", f"cannot download the run '{WANDB}{path}'") as client:
+        if len(path.split("/")) != 3 or {"", ".", ".."} & {*path.split("/")}:
+            raise ValueError(f"it must be {WANDB}entity/project/run")
+        root = Path(client.env.get_cache_dir(), "legged_torque", path)
+        files = {root / file.name: file for file in client.Api().run(path).files()}
+        run = next((file.parent for file in files if file.name == CONFIG_FILE and file.parent != root), root)
+        found = {int(name[1]): file for file in files if (name := re.fullmatch(r"model_(\d+)\.pt", file.name))}
+        numbers = [number for number, file in found.items() if file.parent == run != root]
+        if not numbers:
+            raise ValueError("it holds no settings and checkpoint of train.py --logger wandb")
+        chosen = max(numbers) if checkpoint is None else checkpoint
+        if chosen not in numbers:
+            raise unknown_name("checkpoint", str(chosen), map(str, numbers))
+        for file in (run / CONFIG_FILE, checkpoint_file(run, chosen)):
+            if not is_whole_archive(file):  # else it is here already
+                files[file].download(str(root), replace=True).close()  # a UserError for names that lead out of it
+    return run
 
 
 def upload(folder: Path, repository: str) -> str:
     """Upload a folder to a model of the Hub, and return the address of the commit; a UserError if that fails."""
-    with _hub(f"cannot upload '{folder}' to '{repository}'") as hub:
+    with _client("huggingface_hub", "hub", f"cannot upload '{folder}' to '{repository}'") as client:
+        hub = client.HfApi()
         hub.create_repo(repository, exist_ok=True)
         return str(hub.upload_folder(repo_id=repository, folder_path=folder).commit_url)
 
 
 @contextlib.contextmanager
-def _hub(failure: str) -> Iterator[Any]:
-    """Give the Hub; a UserError if huggingface_hub is not installed, or says why something has failed."""
+def _client(package: str, extra: str, failure: str) -> Iterator[Any]:
+    """Give a package that is a client of a server; a UserError if it is not installed, or says why something failed."""
     try:
-        import huggingface_hub
+        client = importlib.import_module(package)
     except ImportError:
-        raise UserError("huggingface_hub is not installed: pip install 'legged_torque[hub]'") from None
+        raise UserError(f"{package} is not installed: pip install 'legged_torque[{extra}]'") from None
     try:
-        yield huggingface_hub.HfApi()
+        yield client
     except Exception as error:  # of httpx, OSErrors, ValueErrors, and others if an answer is not what it expects
         raise UserError(f"{failure}: {' '.join(str(error).split())[:200]}") from None
 

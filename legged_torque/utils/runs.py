@@ -189,12 +189,10 @@ def package_versions() -> dict[str, str]:
 
     That of this package has the commit of a checkout, and whether files were changed since: "0.1.0+g62a7aea.dirty".
     """
-    versions = {"python": platform.python_version()}
+    versions = {"python": platform.python_version(), **dict.fromkeys(_PACKAGES, "not installed")}
     for package in _PACKAGES:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
     versions["legged_torque"] = __version__ + commit()
     return versions
 
@@ -204,10 +202,8 @@ def commit() -> str:
     """Return what a checkout adds to the version; empty without git, and for an installed package."""
     root = Path(__file__).resolve().parents[2]
     words = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude=*"]
-    if not (root / ".git").exists():
-        return ""
-    try:
-        done = subprocess.run(words, capture_output=True, text=True)
-    except OSError:
-        return ""
-    return f"+g{done.stdout.strip().replace('-', '.')}" if done.returncode == 0 else ""
+    if (root / ".git").exists():
+        with contextlib.suppress(OSError, subprocess.CalledProcessError):
+            done = subprocess.run(words, capture_output=True, text=True, check=True)
+            return f"+g{done.stdout.strip().replace('-', '.')}"
+    return ""

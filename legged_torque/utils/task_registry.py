@@ -21,21 +21,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque import resource_path
-from legged_torque.utils import distributed
+from legged_torque.utils import distributed, runs
 from legged_torque.utils.config import BaseConfig
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, printable, unknown_name
 from legged_torque.utils.files import remove_stale_parts
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.policies import policy_dir
-from legged_torque.utils.runs import (
-    checkpoint_number,
-    checkpoint_numbers,
-    find_checkpoint,
-    find_run,
-    load_config,
-    new_run_dir,
-)
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -59,7 +51,7 @@ class LoadedRun:
     @property
     def iterations(self) -> int:
         """Iterations after which the checkpoint was saved."""
-        return checkpoint_number(self.checkpoint)
+        return runs.checkpoint_number(self.checkpoint)
 
     @property
     def task(self) -> str:
@@ -136,9 +128,7 @@ class TaskRegistry:
             raise UserError(f"the class of task '{name}' must be a class, not {found!r}")
         return found
 
-    def get_cfgs(
-        self, name: str, args: Options | None = None, run_config: dict[str, Any] | None = None
-    ) -> tuple[Any, Any]:
+    def get_cfgs(self, name: str, args: Options | None = None, run_config: dict | None = None) -> tuple[Any, Any]:
         """Return copies of the settings of a task and its training, or of a loaded run's, as ``args`` change them.
 
         With ``args``, a UserError names the first value that is not allowed, before torch and the classes that the
@@ -195,12 +185,12 @@ class TaskRegistry:
             _, train_cfg = self.get_cfgs(name, args)
         default = experiment_dir(train_cfg, args.log_root if args else None)
         root = default if log_root == "default" else log_root and Path(log_root)
-        log_dir = str(new_run_dir(root, train_cfg.runner.run_name)) if root else None
+        log_dir = str(runs.new_run_dir(root, train_cfg.runner.run_name)) if root else None
         runner = train_cfg.make_runner(env, name, log_dir)
         if args is not None and args.resume:
-            folder = find_run(root or default, args.load_run)
+            folder = runs.find_run(root or default, args.load_run)
             remove_stale_parts(folder)
-            runner.resume(str(find_checkpoint(folder, args.checkpoint)))
+            runner.resume(str(runs.find_checkpoint(folder, args.checkpoint)))
         return runner, train_cfg
 
     def load_run(self, options: Options) -> LoadedRun:
@@ -210,13 +200,13 @@ class TaskRegistry:
         """
         if options.policy and options.load_run:
             raise UserError("--policy and --load_run exclude each other")
-        chosen = str(policy_dir(options.policy)) if options.policy else options.load_run
+        chosen = str(policy_dir(options.policy, options.checkpoint)) if options.policy else options.load_run
         experiment = options.experiment_name
         if options.task and not experiment:
             experiment = self.get_cfgs(options.task)[1].runner.experiment_name
         root, pattern = Path(options.log_root or LOGS, experiment or ""), "*" if experiment else "*/*"
-        folder = find_run(root, chosen, pattern)
-        config = load_config(folder)
+        folder = runs.find_run(root, chosen, pattern)
+        config = runs.load_config(folder)
         task = str(config["task"])
         if options.task and task != options.task:
             raise UserError(f"the run '{folder}' is of task '{task}', not '{options.task}'")
@@ -226,11 +216,11 @@ class TaskRegistry:
             from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
 
             print_notes(robot_notes(resource_path(robot), resource_path(trained)))
-        file = find_checkpoint(folder, options.checkpoint)
-        newer_runs = not chosen and any(
-            run.name > folder.name and checkpoint_numbers(run) for run in root.glob(pattern)
-        )
-        if newer_runs or (options.checkpoint is None and checkpoint_number(file) != checkpoint_numbers(folder)[-1]):
+        file = runs.find_checkpoint(folder, options.checkpoint)
+        others = filter(runs.checkpoint_numbers, root.glob(pattern))
+        are_newer = not chosen and any(other.name > folder.name for other in others)
+        is_last = runs.checkpoint_number(file) == runs.checkpoint_numbers(folder)[-1]
+        if are_newer or (options.checkpoint is None and not is_last):
             print(f"Newer checkpoints than '{file}' are damaged; taking this one.")
         return LoadedRun(folder, config, *cfgs, file)
 

@@ -341,7 +341,7 @@ def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
     """A package that is not installed is named with its extra, on export and when the policy is run."""
     task = make_task("a1_torque", num_envs=3)
     monkeypatch.setitem(sys.modules, package, None)
-    message = f"{package} is not installed; exported policies need the extra: pip install 'legged_torque[export]'"
+    message = f"{package} is not installed; this needs the extra: pip install 'legged_torque[export]'"
     assert error_of(export_policy, task, None, tmp_path / "out", "a1_torque", TRAINING) == message
     assert not list(tmp_path.iterdir())
     if package != "onnx":

@@ -1,20 +1,14 @@
 """Training itself: every task learns, a checkpoint brings everything back or is refused, and nothing gets lost."""
 
 import math
-import sys
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 from support.runners import build_runner, networks
 from support.settings import COMBINATIONS, TASKS, error_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
-from legged_torque.envs import task_registry
-from legged_torque.learning.training_log import WandbWriter
-from legged_torque.utils.errors import UserError
 
 WORLDS, STEPS = 4, 4
 BATCH = WORLDS * STEPS
@@ -138,18 +132,3 @@ def test_checkpoints_that_do_not_fit(make_runner, tmp_path):
         save(str(path))
         assert str(path) in error_of(runner.load, str(path))
     assert all(torch.equal(networks(runner)[key], value) for key, value in before.items())
-
-
-def test_wandb(monkeypatch, tmp_path):
-    """It gets the settings as plain values; its errors become one line."""
-    uploaded = {}
-    wandb = SimpleNamespace(
-        Error=ArithmeticError, config=SimpleNamespace(update=uploaded.update), init=lambda **_: None
-    )
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    monkeypatch.setattr("rsl_rl.utils.wandb_log_writer.wandb", wandb)
-    WandbWriter(str(tmp_path), "project").store_config(task_registry.get_cfgs("a1_torque")[0], {"seed": 1})
-    assert uploaded["env_cfg"]["control"]["torque_scale"] == 8.0 and uploaded["train_cfg"] == {"seed": 1}
-    wandb.init = lambda **_: 1 / 0
-    with pytest.raises(UserError, match="--logger wandb: division by zero"):
-        WandbWriter(str(tmp_path), "project")

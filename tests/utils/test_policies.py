@@ -43,7 +43,7 @@ def test_scripts(tmp_path):
         ("demo.py", [name[:-1]], f"did you mean '{name}'?"),
         ("play.py", [f"--policy={name}", "--load_run=x"], "--policy and --load_run exclude each other"),
         ("train.py", [f"--policy={name}"], "--policy is for play.py, evaluate.py and export.py"),
-        ("sim2sim.py", [name[:-1]], f"nor a bundled policy of that name: {NAMES[0]}"),
+        ("sim2sim.py", [name[:-1]], f"nor a bundled policy: {NAMES[0]}"),
     ):
         assert_told_in_one_line(run_here(script, *words, root=tmp_path), message)
 
