@@ -37,7 +37,7 @@ class HeightGrid:
             nrow=heights.shape[0],
             ncol=heights.shape[1],
             size=[x, y, max(highest - lowest, 1e-3), _BASE],  # level ground must have a height, too
-            userdata=np.ascontiguousarray(heights).ravel(),
+            userdata=np.ascontiguousarray(heights, dtype=float).ravel(),  # MuJoCo reads float32 five times as slowly
         )
         geom = next(geom for geom in spec.worldbody.geoms if geom.name == floor)
         geom.type, geom.hfieldname = mujoco.mjtGeom.mjGEOM_HFIELD, floor
