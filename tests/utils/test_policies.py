@@ -22,7 +22,7 @@ def test_cards(name, tmp_path):
     folder = policy_dir(name)
     card = read_card(folder)
     assert {*card["files"], CARD} == {path.name for path in folder.iterdir()} and card["policy"] == name
-    status, _, error = run_here("sim2sim.py", name, "--steps=300", "--robots=2", "--json=measured.json", root=tmp_path)
+    status, _, error = run_here("sim2sim.py", name, "--steps=120", "--robots=2", "--json=measured.json", root=tmp_path)
     assert status == 0, error
     here = json.loads((tmp_path / "measured.json").read_text())["metrics"]["track_percentage"]
     mean, deviation = card["metrics"]["none"]["track_percentage"]
