@@ -5,7 +5,6 @@ import itertools
 import pytest
 import torch
 from support.gravity import FEW, STD, TASK, words_of
-from support.gravity import made as made  # a fixture
 from support.settings import error_of, get_cfgs, parse
 from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict

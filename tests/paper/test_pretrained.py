@@ -1,14 +1,23 @@
 """Trainings that start from a pre-trained policy: its file, what fits, and the critic's head start."""
 
+import shutil
+
 import pytest
 import torch
 from support.gravity import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
-from support.gravity import made as made  # a fixture
 from support.scripts import assert_told_in_one_line, contents, run_here
 from support.settings import get_cfgs
 
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
 from legged_torque.paper.gravity.pretrained import check_making, check_spaces, read_pretrained
+
+
+@pytest.fixture(scope="module")
+def made(made, tmp_path_factory):
+    """A copy of the folder, in which there may be trainings."""
+    folder, file, *others = made
+    root = shutil.copytree(folder, tmp_path_factory.mktemp("copy") / "root")
+    return root, root / file.relative_to(folder), *others
 
 
 @pytest.fixture(scope="module")

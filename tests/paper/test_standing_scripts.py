@@ -6,7 +6,6 @@ import sys
 import matplotlib.image
 import torch
 from support.gravity import TASK
-from support.gravity import made as made  # a fixture
 from support.reports import line, write_run
 from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 

@@ -106,17 +106,10 @@ def test_place_on_ground():
     assert (task.projected_gravity[:, 2] < -0.95).all() and (task.projected_gravity[:, 2] > -0.99999).any()
 
 
-def test_controller_stands_up():
-    """At 200 Hz, at least 95% of random initial states stand after 3 s, with little torque; episodes must be longer."""
-    task = make_trial(80)
-    controller = make_controller(task, 80)
-    place_on_ground(task, controller.dynamics)
-    result = measure_standing(task, act_by_controller(controller), 3.0)
-    assert result.share >= 0.95
-    assert result.share == result.standing.float().mean()
-    assert 1.0 < result.mean_torque < 8.0
+def test_trials_are_shorter_than_episodes(task):
+    """Time to stand is within an episode; see test_standing_scripts.py for how the controller stands up."""
     with pytest.raises(UserError, match="do not fit"):
-        measure_standing(task, act_by_controller(controller), 1000.0)
+        measure_standing(task, act_by_controller(make_controller(task, 16)), 1000.0)
 
 
 @pytest.mark.parametrize("name", ["a1_torque", "anymal_c_torque", "g1_torque"])
