@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
-from support.scripts import COMMAND, PATHS
+from support.scripts import COMMAND, PATHS, run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
@@ -24,37 +24,55 @@ SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--s
 SMALL += ["--device=cpu", "--logger=none", "--set=evaluation.interval=0", "--task=a1_position"]
 
 
-def train_and_end(folder, number, *words):
-    """Send train.py on two cores a signal after an iteration; return status, output, number of others."""
-    command = [*COMMAND, ROOT / "scripts" / "train.py", *SMALL, f"--log_root={folder}", *words]
-    environment = os.environ | PATHS | {"OMP_NUM_THREADS": "2"}
+TWO_CORES = pytest.mark.skipif(sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="two cores of Linux")
+
+
+def end_first_of_two(number, line, *command):
+    """Send the first of two processes a signal after a line; return its status, and the output until both have ended.
+
+    Args:
+        number: The signal.
+        line: How the line begins.
+        command: The script and its words.
+    """
+    how = {"env": os.environ | PATHS | {"OMP_NUM_THREADS": "2"}, "text": True, "stderr": subprocess.STDOUT}
     output, others = "", []
-    with subprocess.Popen(
-        command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    ) as process:
-        for line in process.stdout:  # until all have closed it
-            output += line
-            if line.startswith("iteration ") and not others:
+    with subprocess.Popen([*COMMAND, *command], stdout=subprocess.PIPE, **how) as process:
+        for text in process.stdout:  # until all have closed it
+            output += text
+            if text.startswith(line) and not others:
                 others = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
                 process.send_signal(number)
-    assert "Traceback" not in output, output
-    return process.returncode, output, len(others)
+    assert len(others) == 1 and "Traceback" not in output and "leak" not in output, output
+    return process.returncode, output
 
 
-@pytest.mark.skipif(sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="two cores of Linux")
+@TWO_CORES
 def test_all_cores(tmp_path):
-    """Two processes train one policy: both end when the first one is interrupted, resume, and end when it is killed."""
-    status, output, others = train_and_end(tmp_path, signal.SIGINT, "--max_iterations=100000")
-    assert (status, others) == (130, 1) and output.count("Stopping after this iteration") == 1
-    (run,) = (tmp_path / "a1_position").iterdir()
+    """A resumed run has its two processes again, which train one policy; both end when the first one is interrupted."""
+    words = [*SMALL, f"--log_root={tmp_path}"]
+    assert run_here("train.py", *words, "--max_iterations=1", root=tmp_path)[0] == 0
+    (config,) = tmp_path.glob("a1_position/*/config.yaml")
+    config.write_text(config.read_text().replace("processes: 1\n", "processes: 2\n"))
+    command = [ROOT / "scripts" / "train.py", *words, "--max_iterations=100000", "--resume"]
+    status, output = end_first_of_two(signal.SIGINT, "iteration ", *command)
+    assert status == 130 and output.count("Stopping after this iteration") == 1
+    (run,) = set((tmp_path / "a1_position").iterdir()) - {config.parent}
     assert yaml.safe_load((run / "config.yaml").read_text())["processes"] == 2
     last = max(run.glob("model_*.pt"), key=lambda file: int(file.stem.split("_")[1]))
-    state = torch.load(last, weights_only=True)
-    assert state["infos"]["total_timesteps"] == state["iter"] * 2 * WORLDS * STEPS > 0
-    status, output, others = train_and_end(tmp_path, signal.SIGKILL, "--resume")
-    assert (status, others) == (-signal.SIGKILL, 1) and "start anew" not in output
-    first = re.search(r"^iteration (\d+) of \d+, .*?; steps ([\d,]+)", output, flags=re.MULTILINE)
-    assert int(first[1]) == state["iter"] + 1 and int(first[2].replace(",", "")) == int(first[1]) * 2 * WORLDS * STEPS
+    state, first = torch.load(last, weights_only=True), WORLDS * STEPS
+    assert state["infos"]["total_timesteps"] == first + (state["iter"] - 1) * 2 * WORLDS * STEPS > first
+    assert re.search(rf"^iteration 2 of 100000, .*?; steps {first + 2 * WORLDS * STEPS}", output, flags=re.MULTILINE)
+
+
+@TWO_CORES
+def test_the_others_end_with_the_first(tmp_path):
+    """One process per usable core is started; once they run, they end when the first one is killed."""
+    (tmp_path / "both.py").write_text(
+        "import time\nfrom legged_torque.utils import distributed as d\n"
+        "if not d.use_cores(d.usable_cores()):\n    print('started', flush=True)\ntime.sleep(60)\n"
+    )
+    assert end_first_of_two(signal.SIGKILL, "started", tmp_path / "both.py")[0] == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])
