@@ -194,16 +194,21 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
 
 
 def test_tiles_are_crossed_after_training(stage, tmp_path):
-    """That is a step of its own, which is done again alone, and is not possible with other tiles in the same folder."""
+    """That and a sweep are steps of their own, done again alone; other tiles in the same folder are refused."""
     values = SMALL | {"tasks": ["a1_torque"], "grounds": {"kinds": ["flat", "pits"], "levels": [0, 0.5]}}
+    values["sweeps"] = {"ground_friction": {"domain_rand.ground_friction": {"set": [0.4, 1.2]}}}
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     words = [file, f"--out={out}", "--device=cpu"]
     (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
     assert experiment_here(*words, tmp_path=tmp_path)[0] == 0
     cell = out / "a1_torque-low-s1"
-    log, result = (cell / "evaluate.log").read_text(), cell / "grounds.json"
+    log, result = (cell / "evaluate.log").read_text().splitlines()[0], cell / "grounds.json"
     assert " --num_envs=40 --terrain flat pits --level 0.0 0.5 " in log and "--perturbation" not in log
     assert json.loads(result.read_text())["experiment_name"] == cell.name and not list(cell.glob("*.part"))
+    swept = json.loads((cell / "sweep_ground_friction.json").read_text())  # test_sweep.py gives it to the script
+    assert (swept["sweep"], swept["perturbation"]) == ("ground_friction", "none") and swept["set"].startswith(
+        "domain_rand.ground_friction="
+    )
     result.unlink()
     listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
     assert listed == "a1_torque-low-s1: evaluate in rough ground\n"
