@@ -89,7 +89,7 @@ def opened(browser, page):
     address = page.server.url.partition("?token=")[0]
     browser.get(address)
     assert "with its token" in text_of(browser)
-    open_page(browser, page.server.url)
+    browser.get(page.server.url)
     open_page(browser, address)
     return browser
 
@@ -242,6 +242,14 @@ def test_no_curve_is_cut(opened, session):
         assert label == "time [s]" and high >= largest
 
 
+def test_recording_without_a_renderer(opened, page):
+    """The page says why there is no video."""
+    click(opened, "Record")
+    wait_for(lambda: "Stop and download" in text_of(opened))
+    click(opened, "Stop and download")
+    wait_for(lambda: "no renderer in tests" in text_of(opened))
+
+
 def test_phone(opened):
     """The sheet is as wide as the page; the plots, at its top, can be unfolded; both robots are above it."""
     with screen(opened, 390, 844, 0.5, mobile=True):
@@ -254,15 +262,6 @@ def test_phone(opened):
         wait_for(lambda: share(opened, is_dark, **robots) > 0.005 and share(opened, is_orange, **robots) > 0.005)
         click(opened, plots)
         wait_for(lambda: "v_x, forward [m/s]" in text_of(opened))
-    open_page(opened, opened.current_url)
-
-
-def test_recording_without_a_renderer(opened, page):
-    """The page says why there is no video."""
-    click(opened, "Record")
-    wait_for(lambda: "Stop and download" in text_of(opened))
-    click(opened, "Stop and download")
-    wait_for(lambda: "no renderer in tests" in text_of(opened))
 
 
 def test_rough_ground(browser, tmp_path):
