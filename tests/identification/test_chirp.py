@@ -15,7 +15,7 @@ from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
 
-RATE, SECONDS = 500.0, 10.0
+RATE, SECONDS = 500.0, 6.0
 
 
 @pytest.fixture(scope="module")
