@@ -163,7 +163,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
         is_complete = not runner.stopped_by
-    except TrainingError:
+    except (TrainingError, BrokenPipeError):
         runner.close()
         raise
     finally:

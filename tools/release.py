@@ -33,9 +33,9 @@ def main() -> None:
     cli.check_output(Path("dist", f"legged_torque-{version}.tar.gz"))
     with tempfile.TemporaryDirectory() as temporary:
         built, dist = build(Path(temporary), version), Path("dist")
-        run("git", "tag", "-a", f"v{version}", "-m", f"legged_torque {version}")
         dist.mkdir(exist_ok=True)
         files = [shutil.copy(file, dist) for file in built]
+        run("git", "tag", "-a", f"v{version}", "-m", f"legged_torque {version}")
     print(f"Tagged v{version}. To publish it:")
     print(f"  git push origin v{version}\n  python -m twine upload {' '.join(map(str, files))}")
 

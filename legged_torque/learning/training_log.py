@@ -126,7 +126,7 @@ class NoLogWriter(LogWriter):
 
 
 class WandbWriter(WandbLogWriter):
-    """rsl_rl's writer, with settings and checkpoints such that ``--policy wandb:entity/project/run`` loads them."""
+    """rsl_rl's writer, which uploads what ``--policy wandb:entity/project/run`` loads: settings and checkpoints."""
 
     def __init__(self, log_dir: str, project_name: str) -> None:
         """Start a run of wandb; a UserError if that refuses, as it does without a key."""

@@ -114,7 +114,7 @@ def test_train_stop_resume_play(tmp_path):
         wait_for(lambda: isinstance(getattr(signal.getsignal(signal.SIGINT), "__self__", None), StopRequest))
         os.kill(os.getpid(), signal.SIGINT)
 
-    thread = threading.Thread(target=interrupt)
+    thread = threading.Thread(target=interrupt, daemon=True)
     thread.start()
     status, output, error = run_here("train.py", *task, *changes, "--preset=parallel", "--num_envs=2", root=tmp_path)
     thread.join()

@@ -43,6 +43,9 @@ def test_tracking(share, falls_after, expected):
 def test_our_robot_walks():
     """A bundled policy tracks in plain MuJoCo as its card says of training's worlds, though yaw rates are halved."""
     folder = POLICIES_DIR / "go1" / "position"
+    options = ours.Go1(folder, measure.EQUAL["iterations"]).model.opt
+    assert options.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and options.impratio == measure.EQUAL["impratio"]
+    assert options.iterations == measure.EQUAL["iterations"]
     mean, _ = yaml.safe_load((folder / CARD).read_text("utf-8"))["metrics"]["none"]["track_percentage"]
     assert measure.tracking(ours.Go1(folder)) == pytest.approx(mean, abs=0.06)
 
@@ -58,3 +61,14 @@ def test_our_side(tmp_path, monkeypatch):
     assert row["update_ms"] < row["iteration_ms"] < 1e3 * row["start_up_s"] and "seconds_to_70" not in row
     assert [iterations for iterations, _, _ in row["tracking"]] == [10] and row["tracking"][0][2] < 0.3
     assert command.table([row | {"trainer": "a", "compared": "b", "engine": None}])[2].count("not reached") == 2
+
+
+def test_a_row_that_fails(tmp_path, monkeypatch, capsys):
+    """The others go on, and the table says which one failed; here Python is started as if it were mjlab's."""
+    monkeypatch.setattr(command, "ROWS", [("mjlab", "equal", None), ("mjlab", "default", None)])
+    words = ["--mjlab", sys.executable, "--device=cpu", "--iterations=10", f"--json={tmp_path / 'rows.json'}"]
+    monkeypatch.setattr(sys, "argv", ["compare", *words])
+    with pytest.raises(SystemExit, match="True"):
+        command.main()
+    assert capsys.readouterr().out.count("No module named 'mjlab'") == 2
+    assert ["error" in row for row in measure.read(tmp_path / "rows.json")["rows"]] == [True, True]

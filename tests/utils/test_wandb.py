@@ -78,7 +78,8 @@ def test_up_and_down(server, tmp_path, tmp_path_factory, monkeypatch):
     assert run_here("train.py", *SMALL, "--logger=wandb", "--run_name=up", root=tmp_path)[0] == 0
     (run,), files = tmp_path.glob("logs/*/*_up"), server.models["first"]
     assert [content for name, content in files.items() if name.endswith(".mp4")] == [VIDEO]
-    assert yaml.safe_load(files["config.yaml"])["env_cfg"]["value"]["env"]["num_envs"] == 2  # wandb's own, of values
+    own = yaml.safe_load(files["config.yaml"])  # wandb's, of values
+    assert own["env_cfg"]["value"]["env"]["num_envs"] == 2 and own["train_cfg"]["value"]["num_steps_per_env"] == 4
     script = functools.partial(run_here, root=tmp_path_factory.mktemp("elsewhere"))
     play = functools.partial(script, "play.py", f"--policy={POLICY}", "--device=cpu", "--num_envs=2", "--no_video")
     assert "track_percentage" in play("--steps=2")[1]

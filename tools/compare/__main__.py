@@ -1,17 +1,18 @@
 """Train the Go1 with this package and with mjlab on the machine at hand: ``python -m tools.compare --num_envs 4096``.
 
-Robot, commands, ground, decimation, physics step, networks, epochs and minibatches are the same in all rows. With
-``equal`` settings, so are the friction cone, impratio and iterations of the solver, and there are no mirror images.
-Different in all rows are rewards, observations, random parameters, gains, learning rates and precision (bfloat16 here).
-Seconds are from the command on; start-up ends with the first iteration, which compiles.
+Robot, ground, ranges of commands, decimation, physics step, networks, epochs and minibatches are the same in all rows.
+With ``equal`` settings, so are the friction cone, impratio and the solver's iterations, and there are no mirror images.
+Everything else is each trainer's own: how commands are drawn, contacts, rewards, observations and their normalization,
+random parameters, pushes, gains, coefficients of PPO, and precision (bfloat16 here).
 
-Checkpoints of both walk in plain MuJoCo, each in the model that it was trained with, until one tracks 70% of its
-commands. Isaac Lab is left out since it needs NVIDIA's own index of packages, and MuJoCo Playground 1.0 since it has no
-Go1 any more.
+Seconds count from the start of the command, and each row compiles with empty caches; start-up ends with the first
+iteration. Checkpoints of every tenth iteration (mjlab's: one later) walk in plain MuJoCo, each in its own model, until
+one tracks 70% of its commands. Isaac Lab is left out since it needs NVIDIA's own index of packages, and MuJoCo
+Playground 1.0 since it no longer has a Go1.
 """
 
 import argparse
-import shlex
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,6 +29,7 @@ from tools.compare import measure
 
 ROOT = Path(__file__).resolve().parents[2]
 MJLAB = "mjlab==1.6.0"
+CACHES = ("WARP_CACHE_PATH", "TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR", "CUDA_CACHE_PATH")
 ROWS = [
     ("mjlab", "default", None),
     ("mjlab", "equal", None),
@@ -66,6 +68,7 @@ def main() -> None:
             if args.json:
                 write_json(args.json, result)
     print(*table(result["rows"]), sep="\n")
+    sys.exit(any("error" in row for row in result["rows"]))
 
 
 def parse_args() -> argparse.Namespace:
@@ -79,10 +82,13 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
     check_args(args, num_envs=Count, iterations=Count)
-    if args.iterations < measure.INTERVAL:
-        raise UserError(f"--iterations must be at least {measure.INTERVAL}: there is a checkpoint after each of these")
+    if args.iterations % measure.INTERVAL:
+        raise UserError(
+            f"--iterations must be a multiple of {measure.INTERVAL}: there is a checkpoint after each of these"
+        )
     if args.mjlab and not args.mjlab.is_file():
         raise UserError(f"--mjlab: there is no file '{args.mjlab}'")
+    args.mjlab = args.mjlab and args.mjlab.absolute()  # rows run in another folder
     if args.json:
         check_output(args.json)
     return args
@@ -100,16 +106,18 @@ def install(folder: Path) -> Path:
 def run(
     python: Path, module: str, settings: str, engine: str | None, out: Path, args: argparse.Namespace, device: str
 ) -> dict[str, Any]:
-    """Run a row in a process of its own, and return what it has measured."""
+    """Run a row in a process of its own, and return what it has measured, or the "error" that ended it."""
     words = [str(python), "-m", f"tools.compare.{module}", f"--settings={settings}", f"--out={out}"]
     words += [f"--num_envs={args.num_envs}", f"--iterations={args.iterations}", f"--seed={args.seed}"]
     words += [f"--device={device}", *([f"--engine={engine}"] if engine else []), f"--started={time.time()}"]
+    environment = os.environ | {name: str(out.with_name(name)) for name in CACHES}
     with open(out.with_name("log.txt"), "w+") as log:
-        process = subprocess.run(words, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, check=False)
+        process = subprocess.run(words, cwd=ROOT, env=environment, stdout=log, stderr=subprocess.STDOUT, check=False)
         log.seek(0)
         lines = log.read().splitlines()
     if process.returncode:
-        raise UserError(f"{shlex.join(words[:3])} has failed: {lines[-1] if lines else 'it wrote nothing'}")
+        print(*lines[-20:], f"This row has failed, with exit status {process.returncode}.", sep="\n", flush=True)
+        return {"error": lines[-20:]}
     print(*(line for line in lines if line.startswith("  after")), sep="\n", flush=True)
     return measure.read(out)
 
@@ -120,7 +128,8 @@ def table(rows: list[dict[str, Any]]) -> list[str]:
     lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for row in rows:
         cells = [row["trainer"], row["compared"], row["engine"] or "mujoco_warp"]
-        cells += [f"{row[key]:,.{digits}f}" if key in row else "not reached" for key, (_, digits) in COLUMNS.items()]
+        missing = "failed" if "error" in row else "not reached"
+        cells += [f"{row[key]:,.{digits}f}" if key in row else missing for key, (_, digits) in COLUMNS.items()]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
 

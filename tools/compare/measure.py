@@ -1,4 +1,4 @@
-"""What is measured on both sides in the same way, without torch and rsl_rl of one's own: it runs in either environment.
+"""What is measured on both sides in the same way. It imports neither torch nor rsl_rl, so either environment runs it.
 
 Both train the Go1 on a plane with position control, and both runners are rsl_rl's or have its interface.
 """

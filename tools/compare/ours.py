@@ -24,14 +24,15 @@ TASK = "go1_position"
 class Go1:
     """An exported policy and its robot."""
 
-    def __init__(self, folder: Path) -> None:
-        """Load an export."""
+    def __init__(self, folder: Path, iterations: int = 100) -> None:
+        """Load an export; MuJoCo's solver makes so many iterations at most."""
         self._policy = Policy(folder)
         description = self._policy.description
         self._robot = MujocoRobot(resource_path(description["robot"]["file"]), description)
         self._decimation, self._start = description["timing"]["decimation"], description["initial_state"]
         self.control_step = 1.0 / description["timing"]["control_frequency"]
         self.model, self.data = self._robot.model, self._robot.data
+        self.model.opt.iterations = iterations
 
     def reset(self) -> None:
         """Stand in the initial pose, at rest."""
@@ -59,7 +60,7 @@ def changes(equal: bool, engine: str) -> list[str]:
 
 
 def main() -> None:
-    """Time ``env.step``, train, and evaluate checkpoints until one tracks enough."""
+    """Train, time ``env.step``, and evaluate checkpoints until one tracks enough."""
     args = measure.parse_args()
     words = changes(args.settings == "equal", args.engine)
     options = Options(num_envs=args.num_envs, seed=args.seed, perturbation="low", set=words)
@@ -82,7 +83,7 @@ def walkers(cfgs: tuple, folder: Path, args: Any) -> Iterator[tuple[int, Go1]]:
         runner.load(str(checkpoint_file(folder, iterations)))
         training = {"run": folder.name, "checkpoint": "", "iterations": iterations, "total_steps": 0}
         export_policy(task, runner.alg.policy(), args.out.parent / "exported", TASK, training)
-        yield iterations, Go1(args.out.parent / "exported")
+        yield iterations, Go1(args.out.parent / "exported", cfgs[0].sim.solver_iterations)
 
 
 if __name__ == "__main__":
