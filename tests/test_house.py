@@ -39,7 +39,7 @@ LINES = {
     "legged_torque/viewer": 2487,
     "scripts": 2045,
     "paper": 3048,
-    "tools": 1237,
+    "tools": 1234,
     "tests": 23_713,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""

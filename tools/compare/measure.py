@@ -136,11 +136,6 @@ def time_until_enough(recorder: Recorder, walkers: Iterator[tuple[int, Walker]],
     return result
 
 
-def write(file: Path, result: dict[str, Any]) -> None:
-    """Write what a side has measured."""
-    file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-
-
 def read(file: Path) -> dict[str, Any]:
     """Return what a side has written."""
     return json.loads(file.read_text(encoding="utf-8"))

@@ -16,6 +16,7 @@ from mjlab.tasks.registry import load_env_cfg, load_rl_cfg
 from mjlab.utils.torch import configure_torch_backends
 from tensordict import TensorDict
 
+from legged_torque.utils.files import write_json
 from tools.compare import measure
 
 TASK = "Mjlab-Velocity-Flat-Unitree-Go1"
@@ -98,7 +99,7 @@ def main() -> None:
     result = {"settings": settings, "versions": versions, "step_ms": step}
     result |= recorder.summary(args.num_envs)
     policies = walkers(env.unwrapped, runner, folder)
-    measure.write(args.out, result | measure.time_until_enough(recorder, policies, args.num_envs))
+    write_json(args.out, result | measure.time_until_enough(recorder, policies, args.num_envs))
 
 
 def walkers(env: ManagerBasedRlEnv, runner: Any, folder: Path) -> Iterator[tuple[int, Go1]]:

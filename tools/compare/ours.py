@@ -14,6 +14,7 @@ from legged_torque.deploy.export import export_policy, nominal_cfg
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.envs import task_registry
+from legged_torque.utils.files import write_json
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_file, package_versions
 from tools.compare import measure
@@ -73,7 +74,7 @@ def main() -> None:
     result = {"settings": words, "versions": package_versions(), "step_ms": step}
     result |= recorder.summary(args.num_envs)
     folder = Path(runner.logger.log_dir)
-    measure.write(args.out, result | measure.time_until_enough(recorder, walkers(cfgs, folder, args), args.num_envs))
+    write_json(args.out, result | measure.time_until_enough(recorder, walkers(cfgs, folder, args), args.num_envs))
 
 
 def walkers(cfgs: tuple, folder: Path, args: Any) -> Iterator[tuple[int, Go1]]:
