@@ -79,7 +79,7 @@ def main() -> None:
 
 def walkers(cfgs: tuple, folder: Path, args: Any) -> Iterator[tuple[int, Go1]]:
     """Yield the policies of the run in a folder in order, each exported."""
-    task, runner = build(TASK, (nominal_cfg(cfgs[0]), cfgs[1]), "cpu", str(args.out.parent / "exports"))
+    task, runner = build(TASK, (nominal_cfg(cfgs[0]), cfgs[1]), args.device, str(args.out.parent / "exports"))
     for iterations in range(measure.INTERVAL, args.iterations + 1, measure.INTERVAL):
         runner.load(str(checkpoint_file(folder, iterations)))
         training = {"run": folder.name, "checkpoint": "", "iterations": iterations, "total_steps": 0}
