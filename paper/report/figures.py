@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Draw = Callable[[str], "Figure | None"]
-"""Draws a figure with a title; returns None without data."""
+Draw = Callable[[], "Figure | None"]
+"""Draws a figure; returns None without data."""
 CURVES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "Tracking": ("Figure 3", "track_percentage", {}),
     "Tracking over seconds": ("Figure 3 over seconds", "track_percentage", {"over": "seconds"}),
@@ -64,10 +64,8 @@ def planned_figures(experiment: Experiment, table: pd.DataFrame) -> dict[str, Dr
     figures: dict[str, Draw] = {}
     for title, (paper_title, metric, options) in CURVES.items():
         figures[paper_title if like_paper else title] = partial(draw_curves, experiment, metric, **options)
-    columns = [name for name, (trained, evaluated) in experiment.columns().items() if trained == evaluated]
-    bars = (BARS if like_paper else {}) | {
-        "Metrics": [name for name in columns if not like_paper or name not in ENVIRONMENTS]
-    }
+    own = [name for name, (trained, evaluated) in experiment.columns().items() if trained == evaluated]
+    bars = BARS | {"Metrics": [name for name in own if name not in ENVIRONMENTS]} if like_paper else {"Metrics": own}
     return figures | {title: partial(draw_bars, experiment, table, names) for title, names in bars.items() if names}
 
 
@@ -90,8 +88,8 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
     pyplot, drawn = load_pyplot(), []
     with pyplot.rc_context(SETTINGS):
         for title, draw in figures.items():
-            figure = draw(f"{title} ({conditions})")
-            if figure is not None:
+            if (figure := draw()) is not None:
+                figure.suptitle(f"{title} ({conditions})", fontsize=11)
                 figure.savefig(stream := io.BytesIO(), format="png")
                 image = Image.open(stream).convert("RGB").quantize(COLOURS)
                 image.save(stream := io.BytesIO(), format="png", optimize=True)
@@ -101,7 +99,7 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
     return drawn
 
 
-def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str], title: str) -> Figure | None:
+def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str]) -> Figure | None:
     """Draw the metrics of Table I, a row of panels for each of these columns of the table; return None without data."""
     present = table["mean"].dropna().index.unique("column")
     columns = [name for name in names if name in present]
@@ -114,7 +112,6 @@ def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str],
             draw_metric(axis, experiment, table.loc[column].xs(metric.name, level="metric"), column, metric)
         row[0].set_ylabel(ENVIRONMENTS.get(column, in_words(column)))
     draw_legend(figure, experiment.plan.tasks, table.loc[columns]["paper"].notna().any())
-    figure.suptitle(title, fontsize=11)
     return figure
 
 
@@ -167,7 +164,7 @@ def draw_legend(figure: Figure, tasks: Sequence[str], has_paper: bool) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=5, handlelength=3, frameon=False)
 
 
-def draw_success(experiment: Experiment, environment: str, title: str) -> Figure | None:
+def draw_success(experiment: Experiment, environment: str) -> Figure | None:
     """Draw the share of robots that cross tiles over difficulty, for each kind and all; return None without data."""
     tiles = experiment.crossings().query("environment == @environment")
     if tiles.empty:
@@ -187,7 +184,6 @@ def draw_success(experiment: Experiment, environment: str, title: str) -> Figure
         axis.set_axis_off()
     shown = axes.flat[len(kinds) - 1].get_legend_handles_labels()
     figure.legend(*shown, loc="outside lower center", ncols=columns, handlelength=4, frameon=False)
-    figure.suptitle(title, fontsize=11)
     return figure
 
 

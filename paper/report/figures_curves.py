@@ -47,14 +47,13 @@ def draw_single_curves(files: list[Path]) -> Figure:
 
 
 def draw_curves(
-    experiment: Experiment, metric: str, title: str, *, scale: str = "linear", over: str = "steps", window: float = 0.0
+    experiment: Experiment, metric: str, *, scale: str = "linear", over: str = "steps", window: float = 0.0
 ) -> Figure | None:
     """Draw a metric of an experiment over its trainings, a panel per environment; return None without data.
 
     Args:
         experiment: The results.
         metric: Name of the metric.
-        title: Title of the figure.
         scale: Scale of the axis of the metric, "linear" or "log".
         over: Axis of the trainings, one of :data:`AXES`.
         window: Width of a running median as a share of the longest training; 0 for none.
@@ -94,7 +93,6 @@ def draw_curves(
     lines = {line.get_label(): line for axis in axes[0] for line in axis.lines if line.get_label()[0] != "_"}
     columns = int(width / 3.3)  # as wide as the longest names
     figure.legend(lines.values(), lines, loc="outside lower center", ncols=columns, handlelength=3.5, frameon=False)
-    figure.suptitle(title, fontsize=11)
     return figure
 
 
