@@ -69,12 +69,6 @@ def task_on_plane(task: str) -> str:
     return task.replace("_rough_", "_", 1).removesuffix("_scan")
 
 
-def paper_column(environment: str, metric: str) -> dict[str, float]:
-    """Return the means of a column of Table I by task."""
-    place = list(ENVIRONMENTS).index(environment)
-    return {task: TABLE_I[metric, task][place] for task in PAPER_TASKS}
-
-
 def paper_value(task: str, environment: str, metric: str) -> float | None:
     """Return a mean of Table I; None if the paper has none."""
     return dict(zip(ENVIRONMENTS, TABLE_I.get((metric, task), ()), strict=False)).get(environment)

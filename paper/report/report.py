@@ -49,7 +49,7 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
     table = summarize(experiment, from_step)
     planned, rough = planned_figures(experiment, table), rough_figures(experiment)
     drawn = draw_all(experiment, planned | rough, out)
-    configs, best_torque = first_configs(experiment), tables.best_torque(table)
+    configs = first_configs(experiment)
     signs = {name: int((table["sign"] == sign).sum()) for sign, name in CLASSES.items()}
     values = {
         "title": f"Results of {experiment.folder.resolve().name}",
@@ -60,8 +60,6 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "columns": list(filter(is_of_paper, experiment.columns())),
         "other_columns": [name for name in experiment.columns() if not is_of_paper(name)],
         "signs": signs | {"missing": len(COMPARED) * len(PAPER_TASKS) * len(ENVIRONMENTS) - sum(signs.values())},
-        "best_torque": best_torque,
-        "num_reached": sum(row[-1].startswith(BETTER) for row in best_torque),
         "missing": missing_lines(experiment, from_step),
         "figures": [title for title in planned if title in drawn],
         "absent_figures": [title for title in planned if title not in drawn],

@@ -11,14 +11,12 @@ from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
 from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment
 from legged_torque.paper.report.style import in_words, method
-from legged_torque.paper.values import MODELS, PAPER_TASKS, paper_column, paper_value
+from legged_torque.paper.values import PAPER_TASKS, paper_value
 from legged_torque.utils.config import flat
 
 Rows = list[list[str]]
 SIGNIFICANT = 0.05
 BETTER, WITHIN, WORSE = "✓", "≈", "✗"
-TARGET = 0.05
-"""By how much the best torque method should be better than the paper's best, as a share of it."""
 MIN_TRACKING, MIN_STEPS = 0.5, PAPER_STEPS // 10
 """Tracking and steps of training from which on a task is compared with the paper: who stands has a low cost, too."""
 BASELINES = ["a1_position", "a1_torque"]
@@ -64,20 +62,6 @@ def cells_of(table: pd.DataFrame, column: str, metric: Metric) -> pd.DataFrame:
     """Return the rows of :func:`summarize` for a metric in a column, by task; without those that have no data."""
     chosen = table.index.isin([column], level="column") & table.index.isin([metric.name], level="metric")
     return table[chosen].dropna(subset="mean").droplevel(["column", "metric"])
-
-
-def best_of(cells: pd.DataFrame, metric: Metric) -> str:
-    """Return the task with the best mean."""
-    return cells["mean"].idxmin() if metric.lower_is_better else cells["mean"].idxmax()
-
-
-def significantly_best(cells: pd.DataFrame, metric: Metric) -> str | None:
-    """Return the task that is significantly better than every other one, if there is one."""
-    if len(cells) < 2 or metric not in COMPARED:
-        return None
-    best, pairs = best_of(cells, metric), list(combinations(cells.index, 2))
-    own = [p for pair, p in zip(pairs, compare(cells, pairs), strict=True) if best in pair]
-    return best if all(p < SIGNIFICANT for p in own) else None
 
 
 def compare(cells: pd.DataFrame, pairs: list[tuple[str, str]]) -> np.ndarray:
@@ -128,34 +112,16 @@ def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]
     names = [name for column in columns for name in ([column, "paper"] if column in papers else [column])]
     rows = [["metric", "method", *map(in_words, names)]]
     for metric in PAPER_METRICS:
-        best = {column: significantly_best(cells_of(table, column, metric), metric) for column in columns}
         for task in tasks:
             row = [metric.label if task == tasks[0] else "", method(task)]
             for column in columns:
                 cell = table.loc[column, task, metric.name]
                 text = mean_text(cell, metric.digits, planned)
-                text = marked(text, task == best[column], cell) if cell["seeds"] else text
+                text = marked(text, False, cell) if cell["seeds"] else text
                 row.append(f"{cell['sign']} {text}".strip())
                 if column in papers:
                     row.append(NOTHING if np.isnan(cell["paper"]) else f"{cell['paper']:.{metric.digits}f}")
             rows.append(row)
-    return rows
-
-
-def best_torque(table: pd.DataFrame) -> Rows:
-    """Return the best torque method that is compared and the paper's best, by metric and environment of training."""
-    rows = [["metric", "environment", "paper's best", "our best torque method", "ours", "better by"]]
-    for metric, column in product(COMPARED, ("low", "high", "high_frequency")):
-        papers = pd.DataFrame({"mean": paper_column(column, metric.name)})
-        paper = papers.loc[model := best_of(papers, metric), "mean"]
-        row = [metric.label, column, f"{paper:.{metric.digits}f} ({MODELS[model]})", "no data", "", ""]
-        cells = cells_of(table, column, metric).query("is_compared").drop("a1_position", errors="ignore")
-        if len(cells):
-            cell = cells.loc[task := best_of(cells, metric)]
-            share = metric.gain(cell["mean"], paper) / paper
-            sign = BETTER if share >= TARGET else WITHIN if share > 0.0 else WORSE
-            row[3:] = method(task), marked(mean_text(cell, metric.digits), False, cell), f"{sign} {share:+.1%}"
-        rows.append(row)
     return rows
 
 

@@ -13,8 +13,7 @@ from legged_torque.experiments.matrix import Cell, Matrix
 from legged_torque.paper.report.evaluations import read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
-from legged_torque.paper.report.tables import best_torque, holm, summarize, welch
-from legged_torque.paper.values import TABLE_I
+from legged_torque.paper.report.tables import holm, summarize, welch
 
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
 
@@ -108,22 +107,3 @@ def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.01, math.nan, 0.6, 0.7]) == pytest.approx([0.03, math.nan, 1.0, 1.0], nan_ok=True)
     assert len(holm([])) == 0 and np.isnan(holm([math.nan])).all()
-
-
-def test_best_torque_methods():
-    """The best mean of all tasks but position, against the best of all models: 0.7866, 0.0316 and 0.6977 in low."""
-    numbers = {("doubled", task, name): values[3] for (name, task), values in TABLE_I.items()}
-    numbers |= {("low", task, name): values[0] for (name, task), values in TABLE_I.items()}
-    numbers |= {("low", "a1_position", "track_percentage"): 0.99, ("low", "a1_new", "track_percentage"): 0.84}
-    table = pd.DataFrame({"mean": numbers}).rename_axis(["column", "task", "metric"])
-    table = table.assign(standard_error=0.01, seeds=2, is_final=True, is_compared=True)
-    table.loc[("low", "a1_new", "track_xy"), :] = [0.0310, np.nan, 1, False, True]
-    table.loc[("low", "a1_lying", "cost_of_transport"), :] = [0.0, 0.0, 2, True, False]
-    header, *rows = best_torque(table)
-    assert len(header) == 6 and len(rows) == 12  # without collision forces
-    found = {(row[0], row[1]): row[2:] for row in rows}
-    expected = ["0.7866 (Torque curriculum)", "`a1_new`", "0.8400 ± 0.0100 (2)", "✓ +6.8%"]
-    assert found["Tracking [share]", "low"] == expected
-    assert found["Track xy [m²/s²]", "low"][1:] == ["`a1_new`", "0.0310 (1) †", "≈ +1.9%"]
-    assert found["Cost of transport", "low"][:2] == ["0.6977 (Multi-head)", "Multi-head"]  # not the one that lies
-    assert found["Tracking [share]", "high"][1:] == ["no data", "", ""]
