@@ -6,18 +6,21 @@ import io
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
-from legged_torque.paper.metrics import PAPER_METRICS, Metric
+from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.evaluations import LEVEL
 from legged_torque.paper.report.experiment import Experiment
 from legged_torque.paper.report.figures_curves import SEED_MARK, draw_curves
 from legged_torque.paper.report.style import in_words, name_of, style
+from legged_torque.paper.report.tables import baseline_of
 from legged_torque.paper.values import ENVIRONMENTS, task_on_plane
 from legged_torque.utils.files import write_whole
 
@@ -50,6 +53,7 @@ PAPER_MARK: dict[str, Any] = {"marker": "D", "color": "none", "markerfacecolor":
 SPREAD = 0.09  # distance between the points of two seeds, in distances of bars
 NOTES = {"*": "pale, *: seeds are missing or not finished", "cut": "cut: far beyond others"}
 """Marks below bars, and their meanings in the legend."""
+POINT = {"s": 55, "linewidths": 1.6, "zorder": 5}  # of a difference
 MARKERS = ("o", "s", "^", "D", "v", "P")  # of approaches on rough ground
 
 
@@ -58,10 +62,12 @@ def file_name(title: str) -> str:
     return f"{title.lower().replace(' ', '')}.png"
 
 
-def planned_figures(experiment: Experiment, table: pd.DataFrame) -> dict[str, Draw]:
+def planned_figures(experiment: Experiment, table: pd.DataFrame, differences: pd.DataFrame) -> dict[str, Draw]:
     """Return the functions that draw the figures of a report, by title: the paper's if the experiment is like it."""
     like_paper = experiment.is_like_paper()
     figures: dict[str, Draw] = {}
+    if len(differences):
+        figures["Differences"] = partial(draw_differences, experiment.plan.tasks, differences)
     for title, (paper_title, metric, options) in CURVES.items():
         figures[paper_title if like_paper else title] = partial(draw_curves, experiment, metric, **options)
     own = [name for name, (trained, evaluated) in experiment.columns().items() if trained == evaluated]
@@ -99,9 +105,38 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
     return drawn
 
 
+def draw_differences(tasks: list[str], differences: pd.DataFrame) -> Figure | None:
+    """Draw the differences to the baseline, a row of panels per column of the table; return None without data."""
+    columns, shown = differences["iqm"].dropna().index.unique("column"), differences.index.unique("task")
+    if columns.empty:
+        return None
+    places, colors = np.arange(len(shown)), np.array([style(tasks, task)[0] for task in shown])
+    baseline, size = name_of(baseline_of(tasks)), (15.0, len(columns) * (0.7 + 0.25 * len(shown)) + 0.8)
+    grid = {"figsize": size, "sharey": True, "squeeze": False, "layout": "constrained"}
+    figure, axes = load_pyplot().subplots(len(columns), len(COMPARED), **grid)
+    for axis, (column, metric) in zip(axes.flat, product(columns, COMPARED), strict=True):
+        cells = differences.loc[column].xs(metric.name, level="metric")
+        axis.axvline(0.0, color="black", linewidth=1.0)
+        axis.hlines(places, cells["low"], cells["high"], colors=colors, linewidth=2.5)
+        faces = np.where(cells["is_significant"], colors, "white")
+        axis.scatter(cells["iqm"], places, c=faces, edgecolors=colors, **POINT)
+        side = "left" if metric.lower_is_better else "right"
+        axis.set_xlabel(f"{metric.label}\n" + fill(f"method minus {baseline}; better to the {side}", 44))
+        axis.locator_params(axis="x", nbins=5)
+        axis.grid(axis="x", alpha=0.3)
+    for row, column in zip(axes, columns, strict=True):
+        row[0].set_ylabel(in_words(column))
+    axes[0, 0].set(yticks=places, yticklabels=map(name_of, shown), ylim=(len(shown) - 0.5, -0.5))
+    for color, meaning in (("black", "significant (Welch's test, Holm's correction)"), ("white", "not significant")):
+        axes[0, 0].scatter([], [], c=color, edgecolors="black", label=meaning, **POINT)
+    axes[0, 0].plot([], [], color="black", linewidth=2.5, label="95% bootstrap interval over seeds")
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
 def draw_bars(experiment: Experiment, table: pd.DataFrame, names: Sequence[str]) -> Figure | None:
     """Draw the metrics of Table I, a row of panels for each of these columns of the table; return None without data."""
-    present = table["mean"].dropna().index.unique("column")
+    present = table["iqm"].dropna().index.unique("column")
     columns = [name for name in names if name in present]
     if not columns:
         return None
@@ -129,7 +164,7 @@ def draw_metric(axis: Axes, experiment: Experiment, cells: pd.DataFrame, column:
         axis.plot(place + 0.3, cell["paper"], markersize=5.5, markeredgewidth=1.4, zorder=6, **PAPER_MARK)
         if cell["seeds"]:
             color, _, hatch = style(experiment.plan.tasks, str(task))
-            draw_bar(axis, cell, place, f"{cell['mean']:.{metric.digits}f}", color, hatch)
+            draw_bar(axis, cell, place, f"{cell['iqm']:.{metric.digits}f}", color, hatch)
     axis.set_xticks(range(len(notes)), notes, fontsize=8)
     axis.tick_params(axis="x", length=0)
     axis.set(title=metric.label, xlim=(-0.6, len(notes) - 0.4), ylim=(0, highest))
@@ -137,10 +172,10 @@ def draw_metric(axis: Axes, experiment: Experiment, cells: pd.DataFrame, column:
 
 
 def draw_bar(axis: Axes, cell: pd.Series, place: int, label: str, color: str, hatch: str) -> None:
-    """Draw a bar with its error, its number and a point per seed; pale if it is not final."""
+    """Draw a bar with its interval, its number and a point per seed; pale if it is not final."""
     alpha = 1.0 if cell["is_final"] else UNFINISHED_ALPHA
-    axis.bar(place, cell["mean"], width=0.8, color=color, hatch=hatch, edgecolor="black", linewidth=0.8, alpha=alpha)
-    axis.errorbar(place, cell["mean"], yerr=cell["standard_error"], color="black", capsize=5, linewidth=1.5, zorder=4)
+    axis.bar(place, cell["iqm"], width=0.8, color=color, hatch=hatch, edgecolor="black", linewidth=0.8, alpha=alpha)
+    axis.plot([place, place], cell[["low", "high"]], "_-", color="black", markersize=10, linewidth=1.5, zorder=4)
     places = place + SPREAD * (np.arange(cell["seeds"]) - (cell["seeds"] - 1) / 2)
     axis.plot(places, cell["values"], color="black", linestyle="none", zorder=5, **SEED_MARK)
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}

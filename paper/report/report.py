@@ -22,7 +22,7 @@ from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.figures_curves import FEW
-from legged_torque.paper.report.style import in_words, name_of
+from legged_torque.paper.report.style import in_words, method, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError, counted
@@ -47,9 +47,9 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         How many figures there are, and how many lines on what is missing.
     """
     table = summarize(experiment, from_step)
-    planned, rough = planned_figures(experiment, table), rough_figures(experiment)
+    differences, configs = tables.find_differences(experiment, table), first_configs(experiment)
+    planned, rough = planned_figures(experiment, table, differences), rough_figures(experiment)
     drawn = draw_all(experiment, planned | rough, out)
-    configs = first_configs(experiment)
     signs = {name: int((table["sign"] == sign).sum()) for sign, name in CLASSES.items()}
     values = {
         "title": f"Results of {experiment.folder.resolve().name}",
@@ -60,6 +60,8 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "columns": list(filter(is_of_paper, experiment.columns())),
         "other_columns": [name for name in experiment.columns() if not is_of_paper(name)],
         "signs": signs | {"missing": len(COMPARED) * len(PAPER_TASKS) * len(ENVIRONMENTS) - sum(signs.values())},
+        "baseline": method(tables.baseline_of(experiment.plan.tasks)),
+        "differences": differences,
         "missing": missing_lines(experiment, from_step),
         "figures": [title for title in planned if title in drawn],
         "absent_figures": [title for title in planned if title not in drawn],
@@ -181,7 +183,7 @@ def write_tables(experiment: Experiment, table: pd.DataFrame, out: Path) -> None
     With rough ground, its results are a third file.
     """
     summary = table.rename(columns={"paper": "paper_mean"}).reset_index(names=["environment", "task", "metric"])
-    names = ["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]
+    names = ["task", "environment", "metric", "iqm", "low", "high", "seeds", "paper_mean"]
     write_whole(out / "table.csv", summary[names].to_csv(index=False, lineterminator="\n"))
     text = experiment.evaluations().to_csv(index=False, float_format="%.4g", lineterminator="\n")
     write_whole(out / "evaluations.csv.gz", gzip.compress(text.encode(), mtime=0))  # the same bytes every time

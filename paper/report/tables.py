@@ -1,6 +1,6 @@
-"""Means over seeds and tests of their differences, and the tables of a report: rows of texts, the header first."""
+"""Interquartile means over seeds with their intervals, and the tables of a report: rows of texts, the header first."""
 
-from itertools import combinations, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from scipy import stats
 
 from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
-from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment
+from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment, is_of_paper
 from legged_torque.paper.report.style import in_words, method
 from legged_torque.paper.values import PAPER_TASKS, paper_value
 from legged_torque.utils.config import flat
@@ -19,7 +19,6 @@ SIGNIFICANT = 0.05
 BETTER, WITHIN, WORSE = "✓", "≈", "✗"
 MIN_TRACKING, MIN_STEPS = 0.5, PAPER_STEPS // 10
 """Tracking and steps of training from which on a task is compared with the paper: who stands has a low cost, too."""
-BASELINES = ["a1_position", "a1_torque"]
 NOTHING = "–"
 
 
@@ -27,10 +26,9 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
     """Return all metrics over seeds. The value of a seed is the mean of its finite evaluations that count.
 
     Returns:
-        A row for each column of the report's tables, task and metric (the index), with the columns ``values`` (a list,
-        one number per seed), ``mean``, ``standard_error`` (NaN with one seed), ``seeds`` (how many), ``is_final``
-        (whether all seeds are there and finished), ``is_compared`` (whether they walk), ``paper`` (the mean in Table I,
-        or NaN; also where nothing is compared) and ``sign`` (the :func:`verdict`, or nothing).
+        A row for each column of the report's tables, task and metric (the index), with what :func:`estimate` returns,
+        ``is_final`` (whether all seeds are there and finished), ``is_compared`` (whether they walk), ``paper`` (the
+        mean in Table I, or NaN; also where nothing is compared) and ``sign`` (the :func:`verdict`, or nothing).
     """
     rows = []
     for (column, (trained, evaluated)), task in product(experiment.columns().items(), experiment.plan.tasks):
@@ -38,36 +36,44 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
         is_finished = all(run.is_finished(part["steps"].iloc[-1]) for run, part in counted if len(part))
         seeds = pd.DataFrame([part[METRIC_NAMES].mean() for _, part in counted], columns=METRIC_NAMES)
         steps = min((part["steps"].iloc[-1] for _, part in counted if len(part)), default=0)
-        is_compared = bool(seeds["track_percentage"].mean() >= MIN_TRACKING and steps >= MIN_STEPS)
+        estimates = {name: estimate(seeds[name].dropna().tolist()) for name in METRIC_NAMES}
+        is_compared = bool(estimates["track_percentage"]["iqm"] >= MIN_TRACKING and steps >= MIN_STEPS)
         for metric in CURVE_METRICS:
-            values = seeds[metric.name].dropna()
-            paper = paper_value(task, column, metric.name) if is_compared or values.empty else None
-            is_final = is_finished and len(values) == experiment.num_expected(task, trained)
-            numbers = values.mean(), values.sem(), len(values)
-            sign = ""
-            if metric in COMPARED and paper is not None and len(values):
-                sign = verdict(metric, values.mean(), values.sem(), paper)
-            rows.append([column, task, metric.name, values.tolist(), *numbers, is_final, is_compared, paper, sign])
-    names = ["column", "task", "metric", "values", "mean", "standard_error", "seeds", "is_final", "is_compared"]
-    return pd.DataFrame(rows, columns=[*names, "paper", "sign"]).astype({"paper": float}).set_index(names[:3])
+            found = estimates[metric.name]
+            is_final = is_finished and found["seeds"] == experiment.num_expected(task, trained)
+            paper = paper_value(task, column, metric.name) if is_compared or not found["seeds"] else None
+            sign = verdict(metric, found, paper) if metric in COMPARED and found["seeds"] and paper is not None else ""
+            row = {"column": column, "task": task, "metric": metric.name, **found, "is_final": is_final}
+            rows.append(row | {"is_compared": is_compared, "paper": paper, "sign": sign})
+    return pd.DataFrame(rows).astype({"paper": float}).set_index(["column", "task", "metric"])
 
 
-def verdict(metric: Metric, mean: float, standard_error: float, paper: float) -> str:
-    """Return the sign of a mean that is better or worse than the paper's by more than its error, which may be NaN."""
-    gain, error = metric.gain(mean, paper), np.nan_to_num(standard_error)
-    return BETTER if gain > error else WORSE if gain < -error else WITHIN
+def interquartile_mean(*samples: Any, axis: int = -1) -> Any:
+    """Return the mean without a quarter of the values, rounded down, at each end; of two samples, the difference."""
+    means = [stats.trim_mean(values, 0.25, axis=axis) for values in samples]  # as rliable computes it
+    return means[0] - means[1] if len(means) == 2 else means[0]
 
 
-def cells_of(table: pd.DataFrame, column: str, metric: Metric) -> pd.DataFrame:
-    """Return the rows of :func:`summarize` for a metric in a column, by task; without those that have no data."""
-    chosen = table.index.isin([column], level="column") & table.index.isin([metric.name], level="metric")
-    return table[chosen].dropna(subset="mean").droplevel(["column", "metric"])
+def estimate(*samples: list[float]) -> dict[str, Any]:
+    """Return the interquartile mean of seeds, or by how much it is more than that of others.
+
+    Returns:
+        ``values``, the first sample; ``iqm``, NaN without values; ``low`` and ``high``, its 95% percentile bootstrap
+        interval with the same random numbers in every call, NaN without two values; ``seeds``, of the smaller sample.
+    """
+    seeds, low, high = min(map(len, samples)), np.nan, np.nan
+    if seeds > 1:
+        options: dict[str, Any] = {"n_resamples": 2000, "random_state": np.random.default_rng(0)}
+        result = stats.bootstrap(samples, interquartile_mean, vectorized=True, method="percentile", **options)
+        low, high = result.confidence_interval
+    iqm = interquartile_mean(*samples) if seeds else np.nan
+    return {"values": samples[0], "iqm": iqm, "low": low, "high": high, "seeds": seeds}
 
 
-def compare(cells: pd.DataFrame, pairs: list[tuple[str, str]]) -> np.ndarray:
-    """Return the corrected p value of each pair of tasks, NaN where no test is possible; the tests are one family."""
-    values = cells["values"]
-    return holm([welch(values.get(first, []), values.get(second, [])) for first, second in pairs])
+def verdict(metric: Metric, found: dict[str, Any], paper: float) -> str:
+    """Return the sign of an interval that is better or worse than the paper's as a whole; of the number without one."""
+    gains = [metric.gain(np.nan_to_num(found[end], nan=found["iqm"]), paper) for end in ("low", "high")]
+    return BETTER if min(gains) > 0.0 else WORSE if max(gains) < 0.0 else WITHIN
 
 
 def welch(first: list[float], second: list[float]) -> float:
@@ -87,18 +93,38 @@ def holm(p_values: list[float]) -> np.ndarray:
     return corrected
 
 
-def mean_text(cell: pd.Series, digits: int, planned: int = 0) -> str:
-    """Return mean and standard error with so many decimals, and the number of seeds if it is not the planned one."""
-    if np.isnan(cell["mean"]):
+def find_differences(experiment: Experiment, table: pd.DataFrame) -> pd.DataFrame:
+    """Return the differences to the baseline in all metrics that are compared, in columns like those of Table I.
+
+    Returns:
+        A row for each column, task but the baseline, and metric (the index), with the columns of :func:`estimate`,
+        ``is_significant`` (with Holm's correction over tasks) and ``is_final`` (as both numbers are).
+    """
+    baseline, rows = baseline_of(experiment.plan.tasks), []
+    for column, metric in product(filter(is_of_paper, experiment.columns()), COMPARED):
+        cells = table.loc[column].xs(metric.name, level="metric")
+        base, cells = cells.loc[baseline], cells.drop(baseline)
+        p_values = holm([welch(values, base["values"]) for values in cells["values"]])
+        for (task, cell), p in zip(cells.iterrows(), p_values, strict=True):
+            row = {"column": column, "task": task, "metric": metric.name, **estimate(cell["values"], base["values"])}
+            rows.append(row | {"is_significant": p < SIGNIFICANT, "is_final": cell["is_final"] and base["is_final"]})
+    return pd.DataFrame(rows).set_index(["column", "task", "metric"]) if rows else pd.DataFrame()
+
+
+def baseline_of(tasks: list[str]) -> str:
+    """Return the task that others are compared with: the first one with position control, or else the first one."""
+    return next((task for task in tasks if task.endswith("position") or "_position" in task), tasks[0])
+
+
+def estimate_text(found: Any, form: str, planned: int | None = None) -> str:
+    """Return an estimate as text, and how many seeds it has if others are planned; bold: significant, †: not final."""
+    if not found["seeds"]:
         return NOTHING
-    error = "" if np.isnan(cell["standard_error"]) else f" ± {cell['standard_error']:.{digits}f}"
-    return f"{cell['mean']:.{digits}f}{error}" + ("" if cell["seeds"] == planned else f" ({cell['seeds']:.0f})")
-
-
-def marked(text: str, is_significant: bool, *cells: pd.Series) -> str:
-    """Return a text in bold if it is significant, with a dagger if a number that it comes from is not final."""
-    text = f"**{text}**" if is_significant else text
-    return text if all(cell["is_final"] for cell in cells) else f"{text} †"
+    text = f"{found['iqm']:{form}}"
+    text += "" if np.isnan(found["low"]) else f" [{found['low']:{form}}, {found['high']:{form}}]"
+    text += "" if planned in (None, found["seeds"]) else f" ({found['seeds']})"
+    text = f"**{text}**" if found.get("is_significant") else text
+    return text if found.get("is_final", True) else f"{text} †"
 
 
 def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]) -> Rows:
@@ -116,53 +142,37 @@ def metric_table(experiment: Experiment, table: pd.DataFrame, columns: list[str]
             row = [metric.label if task == tasks[0] else "", method(task)]
             for column in columns:
                 cell = table.loc[column, task, metric.name]
-                text = mean_text(cell, metric.digits, planned)
-                text = marked(text, False, cell) if cell["seeds"] else text
-                row.append(f"{cell['sign']} {text}".strip())
+                row.append(f"{cell['sign']} {estimate_text(cell, f'.{metric.digits}f', planned)}".strip())
                 if column in papers:
                     row.append(NOTHING if np.isnan(cell["paper"]) else f"{cell['paper']:.{metric.digits}f}")
             rows.append(row)
     return rows
 
 
-def differences(table: pd.DataFrame, column: str) -> dict[str, Rows]:
-    """Return tests of all pairs of tasks, and of each task against the baselines, in a column.
-
-    A family of tests has no rows if no test is possible.
-    """
-    tasks = table.loc[[column]].dropna(subset="mean").index.unique("task")
-    families = {"All pairs": list(combinations(tasks, 2))}
-    for baseline in tasks.intersection(BASELINES):
-        families[f"Against {method(baseline)}"] = [(task, baseline) for task in tasks if task != baseline]
-    return {title: difference_table(table, column, pairs) for title, pairs in families.items()}
-
-
-def difference_table(table: pd.DataFrame, column: str, pairs: list[tuple[str, str]]) -> Rows:
-    """Return the differences of pairs of tasks in all metrics, with their p values; nothing if there are none."""
-    rows = [["pair", *(metric.label for metric in PAPER_METRICS)]]
-    rows += [[f"{method(first)} − {method(second)}"] for first, second in pairs]
-    p_values = [compare(cells_of(table, column, metric), pairs) for metric in PAPER_METRICS]
-    for metric, p_of_pairs in zip(PAPER_METRICS, p_values, strict=True):
-        for row, pair, p in zip(rows[1:], pairs, p_of_pairs, strict=True):
-            one, other = (table.loc[column, task, metric.name] for task in pair)
-            p_text = "no p value" if np.isnan(p) else f"p = {p:.2g}"
-            text = f"{one['mean'] - other['mean']:+.{metric.digits}f}, {p_text}"
-            row.append(marked(text, p < SIGNIFICANT, one, other) if one["seeds"] and other["seeds"] else "no data")
-    return [] if np.isnan(p_values).all() else rows
+def difference_table(differences: pd.DataFrame) -> Rows:
+    """Return the differences as a table: a group of rows per column, whose name is in the first of them."""
+    rows, above = [["environment", "method", *(metric.label for metric in COMPARED)]], ""
+    for column, task in differences.index.droplevel("metric").unique():
+        cells = [(differences.loc[column, task, metric.name], f"+.{metric.digits}f") for metric in COMPARED]
+        name = "" if column == above else in_words(column)
+        rows.append([name, method(task), *(estimate_text(cell, form) for cell, form in cells)])
+        above = column
+    return rows
 
 
 def rough_tables(experiment: Experiment, environment: str) -> dict[str, Rows]:
-    """Return the means over difficulties on rough ground, by meaning of the measure, of an environment of training."""
+    """Return what seeds reach on rough ground, mean over difficulties, by meaning of the measure, in an environment."""
     tiles = experiment.crossings().query("environment == @environment")
     kinds, planned = [*tiles["kind"].unique(), "all"], len(experiment.plan.seeds)
     seeds = pd.concat([tiles, tiles.assign(kind="all")]).groupby(["task", "kind", "seed"])[list(MEASURES)].mean()
     tasks = [task for task in experiment.plan.tasks if experiment.num_expected(task, environment)]
     result: dict[str, Rows] = {}
     for measure, meaning in MEASURES.items() if len(tiles) else []:
-        means = seeds[measure].groupby(level=["task", "kind"]).agg(mean="mean", standard_error="sem", seeds="count")
-        cells = means.reindex(pd.MultiIndex.from_product([tasks, kinds]))
-        rows = [[method(task), *(mean_text(cells.loc[task, kind], 2, planned) for kind in kinds)] for task in tasks]
-        result[meaning] = [["task", *kinds], *rows]
+        values = seeds[measure].dropna().groupby(level=["task", "kind"]).agg(list)
+        result[meaning] = [["task", *kinds]]
+        for task in tasks:
+            found = [estimate(values.get((task, kind), [])) for kind in kinds]
+            result[meaning].append([method(task), *(estimate_text(cell, ".2f", planned) for cell in found)])
     return result
 
 

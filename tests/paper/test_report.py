@@ -1,9 +1,8 @@
 """Reports: tables, figures, Markdown, and a page that is whole, escaped, and refers to nothing outside of it."""
 
 import base64
-import csv
-import io
 import re
+from itertools import product
 
 import pandas as pd
 import pytest
@@ -29,11 +28,6 @@ from legged_torque.paper.report.tables import welch
 
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y** ![z](/etc/passwd)"
 pytestmark = pytest.mark.usefixtures("coarse")
-
-
-def rows_of(content):
-    """Return the rows of the bytes of a CSV file as dictionaries."""
-    return list(csv.DictReader(io.StringIO(content.decode())))
 
 
 @pytest.fixture(scope="module")
@@ -85,31 +79,28 @@ def page(report):
 
 def test_table(report):
     """One row per task, column and metric, with the paper's value and nothing where there is nothing."""
-    table = rows_of((report / "table.csv").read_bytes())
-    assert list(table[0]) == ["task", "environment", "metric", "mean", "standard_error", "seeds", "paper_mean"]
-    rows = {(row.pop("task"), row.pop("environment"), row.pop("metric")): list(row.values()) for row in table}
+    table = pd.read_csv(report / "table.csv", dtype=str, keep_default_na=False)
+    assert list(table) == ["task", "environment", "metric", "iqm", "low", "high", "seeds", "paper_mean"]
+    rows = {tuple(row[:3]): row[3:] for row in table.to_numpy().tolist()}
     assert len(rows) == len(table) == 3 * 4 * len(METRIC_NAMES)
-    for key, mean, error, *others in (
-        (("a1_position", "low", "track_percentage"), 0.75, 0.05, "2", "0.7642"),  # sqrt(0.005 / 2)
-        (("a1_position", "doubled", "track_xy"), 3.65, 0.55, "2", ""),  # 3.1 and 4.2, while it trained; it tracks 0.365
-        (("a1_position", "low -> high", "track_xy"), 0.65, 0.05, "2", ""),  # of the last checkpoint
+    for key, iqm, low, high, *others in (
+        (("a1_position", "low", "track_percentage"), 0.75, 0.7, 0.8, "2", "0.7642"),  # of two seeds the interval is all
+        (("a1_position", "doubled", "track_xy"), 3.65, 3.1, 4.2, "2", ""),  # while it trained; it tracks 0.365
+        (("a1_position", "low -> high", "track_xy"), 0.65, 0.6, 0.7, "2", ""),  # of the last checkpoint
     ):
-        assert list(map(float, rows[key][:2])) == pytest.approx([mean, error]) and rows[key][2:] == others
-    assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "1", ""]
-    assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "0", "0.7669"]
+        assert list(map(float, rows[key][:3])) == pytest.approx([iqm, low, high]) and rows[key][3:] == others
+    assert rows["a1_torque", "low", "track_percentage"] == ["0.5", "", "", "1", ""]
+    assert rows["a1_multihead", "low", "track_percentage"] == ["", "", "", "0", "0.7669"]
 
 
 def test_text(text, folder):
     """Numbers stand beside the paper's, marked if not final; test, devices and commands are named, no folder is."""
     words = " ".join(text.split())
-    low, often = "≈ 0.7500 ± 0.0500 | 0.7642", "✗ 0.5500 ± 0.0500 | 0.7163"
-    assert (
-        "**2 of 8 numbers are at least as good" in words
-        and "(better: 1, within it: 1, worse: 6; missing or not compared: 56)" in words
-    )
+    low, often = "≈ 0.7500 [0.7000, 0.8000] | 0.7642", "✗ 0.5500 [0.5000, 0.6000] | 0.7163"
+    assert "**2 of 8 numbers" in words and "(better: 1, within: 1, worse: 6; missing or not compared: 56)" in words
     assert f"| Tracking [share] | PD | {low} | {often} |" in words
     assert "| | Default torque | 0.5000 (1) † | – | – | – |" in words  # after those of the paper
-    assert "| Tracking [share] | PD | 0.6500 ± 0.0500 |" in words.partition("## In other environments")[2]
+    assert "| Tracking [share] | PD | 0.6500 [0.6000, 0.7000] |" in words.partition("## In other environments")[2]
     assert "python scripts/experiment.py paper/experiment.yaml --out paper_again" in words
     assert str(folder.parent) not in words
     assert "| `env.control.what` | a1_position | a1_torque |" in text and "`env.control.same`" not in text
@@ -138,20 +129,27 @@ def test_comparisons_that_mean_nothing(tmp_path, tracking, million):
     assert f"| Tracking [share] | PD | {tracking:.4f} |" in text and "| Collision forces [N] | PD | 99.0 |" in text
 
 
-def test_significant_differences(tmp_path):
-    """A difference far beyond the seeds' is bold; tracking has to be high."""
-    write_experiment(tmp_path / "e", {"low": ["low"]})
-    for task, tracking in {"a1_position": 0.7, "a1_torque": 0.5, "a1_multihead": 0.6}.items():
-        for seed in (1, 2):
-            part = tmp_path / "e" / f"{task}-low-s{seed}" / "2026-01-01_00-00-00"
-            write_part(part, whole_run(tracking + 0.001 * seed))
+def test_differences(tmp_path):
+    """Method minus PD: bold if it is far beyond the seeds', also corrected for two methods; the figure comes first."""
+    write_experiment(tmp_path / "e", {"low": ["low"], "high": ["high"]})
+    trackings = {"a1_position-low": 0.7, "a1_torque-low": 0.5, "a1_multihead-low": 0.71}
+    trackings |= {"a1_position-high": 0.7, "a1_torque-high": 0.696, "a1_multihead-high": 0.704}
+    for (cell, tracking), seed in product(trackings.items(), (1, 2)):
+        if (cell, seed) != ("a1_multihead-low", 2):
+            part = tmp_path / "e" / f"{cell}-s{seed}" / "2026-01-01_00-00-00"
+            write_part(part, whole_run(tracking + 0.001 * seed, track_angular=seed))
     assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.md").read_text()
-    assert "Nothing: all trainings and evaluations are complete." in text
-    assert "| PD | ✗ 0.7015 ± 0.0005 | 0.7642 |" in text
-    assert "|  | Default torque | 5.0150 ± 0.0050 | – |" in text
-    p = 3.0 * welch([0.701, 0.702], [0.501, 0.502])  # the smallest of three
-    assert p < 0.05 and f"| PD − Default torque | **+0.2000, p = {p:.2g}** |" in text
+    rows = text.partition("\n## Differences to PD\n")[2].partition("\n## ")[0].splitlines()
+    tracked = [row.split(" | ")[:3] for row in rows if row.startswith("|")]
+    assert 0.025 < welch([0.701, 0.702], [0.697, 0.698]) < 0.05 and tracked[2:] == [
+        ["| low", "Default torque", "**-0.2000 [-0.2010, -0.1990]**"],
+        ["| ", "Multi-head", "+0.0095 †"],
+        ["| high", "Default torque", "-0.0040 [-0.0050, -0.0030]"],
+        ["| ", "Multi-head", "+0.0040 [+0.0030, +0.0050]"],
+    ]
+    assert "**-2.0000 [-2.0100, -1.9900]** | +0.0000 [-1.0000, +1.0000] | **" in text and "p = " not in text
+    assert re.findall(r"!\[(.*?)\]\((.*?)\)", text)[0] == ("Differences", "differences.png")
 
 
 def test_rough_ground(tmp_path):
@@ -171,14 +169,14 @@ def test_rough_ground(tmp_path):
     assert "Table I" not in text and "## While training" in text and "![Success in low](successinlow.png)" in text
     rows = [line for line in text.splitlines() if line.startswith(("| PD, blind |", "| Default torque, scan |"))]
     assert rows[:2] == [  # 0.75 and 0.375; 0; 0.5 and 0.25
-        "| PD, blind | 0.56 ± 0.19 | 0.00 ± 0.00 | 0.38 ± 0.12 |",
+        "| PD, blind | 0.56 [0.38, 0.75] | 0.00 [0.00, 0.00] | 0.38 [0.25, 0.50] |",
         "| Default torque, scan | 0.50 (1) | 1.00 (1) | 0.67 (1) |",
     ]
-    assert rows[2] == "| PD, blind | 0.25 ± 0.00 | 0.25 ± 0.00 | 0.25 ± 0.00 |" and rows[6].endswith(" – | – | – |")
+    assert rows[2] == "| PD, blind" + 3 * " | 0.25 [0.25, 0.25]" + " |" and rows[6].endswith(" – | – | – |")
     assert "`a1_rough_torque_scan` in low, seed 2: 'a1_rough_torque_scan-low-s2/grounds.json' cannot be read; " in text
     assert (tmp_path / "out" / "successinlow.png").read_bytes().startswith(b"\x89PNG")
-    tiles = rows_of((tmp_path / "out" / "grounds.csv").read_bytes())
-    assert len(tiles) == 9 and [tiles[1][key] for key in ("seed", "kind", "crossed")] == ["1", "pits", "0.5"]
+    tiles = pd.read_csv(tmp_path / "out" / "grounds.csv")
+    assert len(tiles) == 9 and tiles.loc[1, ["seed", "kind", "crossed"]].tolist() == [1, "pits", 0.5]
 
 
 @pytest.mark.parametrize(
@@ -215,10 +213,10 @@ def test_tables_of_the_page(text, page):
     for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
         rows = [each[2:-2].split(" | ") for each in block.splitlines() if not each.startswith("| ---")]
         tables.append([[re.sub(r"`|\*\*", "", cell) for cell in row] for row in rows])
-    assert page.tables == tables and len(tables) == 4
-    assert re.findall(r"^## (.*)", text, re.M)[:2] == ["Table I", "What is missing"]
+    assert page.tables == tables and len(tables) == 5
+    assert re.findall(r"^## (.*)", text, re.M)[:2] == ["Table I", "Differences to PD"]
     assert page.tables[1][0] == ["metric", "method", "low", "paper", "high_frequency", "paper", "doubled", "paper"]
-    assert page.tables[1][1][6:] == ["0.3650 ± 0.0550", "–"]  # it tracks too little to be compared
+    assert page.tables[1][1][6:] == ["0.3650 [0.3100, 0.4200]", "–"]  # it tracks too little to be compared
     assert all(cell[:1].isdecimal() for row in page.tables[1] if row[0].startswith("Collision") for cell in row[2:4])
     assert {"better", "within", "worse", None} == set(page.kinds)
 
@@ -226,7 +224,7 @@ def test_tables_of_the_page(text, page):
 def test_the_page_is_whole(report, page):
     """It refers to nothing but itself: pictures and videos are in it, byte by byte, links lead to its own headings."""
     source, files = (report / "report.html").read_text(), {file.read_bytes() for file in report.glob("*.png")}
-    assert len(files) == 6 and all(file.startswith(b"\x89PNG") for file in files)
+    assert len(files) == 7 and all(file.startswith(b"\x89PNG") for file in files)
     data = [reference.partition(",")[::2] for reference in page.references if reference.startswith("data:")]
     pictures = {base64.b64decode(content) for kind, content in data if kind == "data:image/png;base64"}
     assert pictures == files

@@ -75,7 +75,7 @@ def test_report_on_runs(logs, capsys):
     table = next(table for table in Page((logs / "report" / "report.html").read_text()).tables if "method" in table[0])
     assert table[:4] == [
         ["metric", "method", "low", "own"],
-        ["Tracking [share]", "mine", "–", "0.5500 ± 0.0500 (2)"],
+        ["Tracking [share]", "mine", "–", "0.5500 [0.5000, 0.6000] (2)"],
         ["", "mine wide", "0.7000 (1)", "–"],
         ["", "other", "–", "0.4000 (1)"],
     ]

@@ -10,10 +10,11 @@ from scipy import stats
 from support.reports import HEADER, SETTINGS, line, whole_run, write_experiment, write_part
 
 from legged_torque.experiments.matrix import Cell, Matrix
+from legged_torque.paper.metrics import PAPER_METRICS
 from legged_torque.paper.report.evaluations import read_evaluations
 from legged_torque.paper.report.experiment import Experiment, Training, read_experiment
 from legged_torque.paper.report.report import run_problems
-from legged_torque.paper.report.tables import holm, summarize, welch
+from legged_torque.paper.report.tables import baseline_of, estimate, holm, summarize, verdict, welch
 
 CELL = Cell(Path("a1_torque-low-s1"), "a1_torque", "low", 1, ("low",))
 
@@ -107,3 +108,24 @@ def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.01, math.nan, 0.6, 0.7]) == pytest.approx([0.03, math.nan, 1.0, 1.0], nan_ok=True)
     assert len(holm([])) == 0 and np.isnan(holm([math.nan])).all()
+
+
+def test_estimates():
+    """A quarter of the seeds at each end does not count. Between two is all; of more, numpy alone finds the same."""
+    values = [9.0, 1.0, 4.0, 2.0, 100.0, 3.0, 0.0, 7.0]
+    for count, middle in {1: [9], 2: [9, 1], 4: [2, 4], 5: [2, 4, 9], 8: [2, 3, 4, 7]}.items():
+        assert estimate(values[:count])["iqm"] == pytest.approx(np.mean(middle))
+    ends = [[estimate(values[:count])[end] for end in ("low", "high")] for count in (0, 1, 2, 2)]
+    assert np.isnan([*ends[0], *ends[1], estimate([])["iqm"]]).all() and ends[2] == ends[3] == [1.0, 9.0]
+    random = np.random.default_rng(1)
+    samples = random.normal(size=(2, 12)).tolist()
+    one, other = (np.sort(random.choice(part, (20_000, 12)), axis=1)[:, 3:-3].mean(axis=1) for part in samples)
+    for found, middles in ((estimate(samples[0]), one), (estimate(*samples), one - other)):
+        assert [found["low"], found["high"]] == pytest.approx(np.percentile(middles, [2.5, 97.5]), abs=0.05)
+
+
+def test_comparisons():
+    """Better or worse than the paper is a whole interval, or one seed's number; position control is the baseline."""
+    for values, paper, signs in (([0.6, 0.8], 0.5, "✓✗"), ([0.6, 0.8], 0.65, "≈≈"), ([0.6], 0.7, "✗✓")):
+        assert "".join(verdict(PAPER_METRICS[i], estimate(values), paper) for i in (0, -1)) == signs
+    assert baseline_of(["b", "a"]) == "b" and baseline_of(["b", "go_position_scan", "position"]) == "go_position_scan"
