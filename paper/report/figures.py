@@ -32,7 +32,6 @@ Draw = Callable[[], "Figure | None"]
 """Draws a figure; returns None without data."""
 CURVES: dict[str, tuple[str, str, dict[str, Any]]] = {
     "Tracking": ("Figure 3", "track_percentage", {}),
-    "Tracking over seconds": ("Figure 3 over seconds", "track_percentage", {"over": "seconds"}),
     "Height": ("Figure 5a", "height", {}),
     "Critic": ("Figure 5b", "critic_gradient_norm", {"scale": "log", "window": 0.03}),
 }

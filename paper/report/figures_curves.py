@@ -1,4 +1,4 @@
-"""Metrics over steps or time of training: the paper's Figures 3 and 5, and learning curves of single trainings."""
+"""Metrics over steps of training: the paper's Figures 3 and 5, and learning curves of single trainings."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-AXES = {"steps": (MILLION, "environment steps [millions]"), "seconds": (1.0, "time of training [s]")}
-"""Horizontal axes of curves: unit and label."""
+STEPS_LABEL = "environment steps [millions]"
 FEW = 0.1  # million steps, below which single steps are counted
 SINGLE_CURVES = ("track_percentage", "track_xy", "cost_of_transport")  # metrics shown for single trainings
 SEED_LINES = ("-.", "-", "--", ":")  # line styles of single trainings, by seed modulo four
@@ -39,26 +38,23 @@ def draw_single_curves(files: list[Path]) -> Figure:
         for (_, task, environment, seed), rows in trainings:
             label = ", ".join(filter(None, [name_of(task), environment, f"seed {seed}"]))
             color, line = style(tasks, task)[0], SEED_LINES[seed % len(SEED_LINES)]
-            draw_curve(axis, seed_curves({seed: rows}, metric, "steps"), [], label, color, line)
-        axis.set(title=LABELS[metric], xlabel=AXES["steps"][1], xlim=(0, None), ylim=(0, None))
+            draw_curve(axis, seed_curves({seed: rows}, metric), [], label, color, line)
+        axis.set(title=LABELS[metric], xlabel=STEPS_LABEL, xlim=(0, None), ylim=(0, None))
         axis.grid(alpha=0.3)
     axes[0].legend(fontsize="small")
     return figure
 
 
-def draw_curves(
-    experiment: Experiment, metric: str, *, scale: str = "linear", over: str = "steps", window: float = 0.0
-) -> Figure | None:
+def draw_curves(experiment: Experiment, metric: str, *, scale: str = "linear", window: float = 0.0) -> Figure | None:
     """Draw a metric of an experiment over its trainings, a panel per environment; return None without data.
 
     Args:
         experiment: The results.
         metric: Name of the metric.
         scale: Scale of the axis of the metric, "linear" or "log".
-        over: Axis of the trainings, one of :data:`AXES`.
         window: Width of a running median as a share of the longest training; 0 for none.
     """
-    tasks, panels = experiment.plan.tasks, curves_of(experiment, metric, over)
+    tasks, panels = experiment.plan.tasks, curves_of(experiment, metric)
     if not panels:
         return None
     width = max(7.0, 5.0 * len(panels))
@@ -79,10 +75,9 @@ def draw_curves(
         axis.axvline(end * (1.0 + STRIP / 2), color="#999999", linewidth=0.8)
         axis.set_xlim(0, end * (1.0 + STRIP * (len(tasks) + 0.7)))
         axis.set_xticks([tick for tick in axis.get_xticks() if 0 <= tick <= end])
-        is_short = over == "steps" and end < FEW
-        if is_short:
+        if end < FEW:
             axis.xaxis.set_major_formatter(lambda steps, _: f"{steps * MILLION:,.0f}")
-        axis.set_xlabel("environment steps" if is_short else AXES[over][1])
+        axis.set_xlabel("environment steps" if end < FEW else STEPS_LABEL)
         axis.set_title(ENVIRONMENTS.get(environment, in_words(environment)))
         axis.grid(alpha=0.3)
     if scale == "linear":
@@ -96,24 +91,24 @@ def draw_curves(
     return figure
 
 
-def curves_of(experiment: Experiment, metric: str, over: str) -> dict[str, dict[str, pd.DataFrame]]:
+def curves_of(experiment: Experiment, metric: str) -> dict[str, dict[str, pd.DataFrame]]:
     """Return the curves by environment, those of Table I first, and task; entries without data are left out."""
     panels: dict[str, dict[str, pd.DataFrame]] = {}
     order = [*ENVIRONMENTS, *experiment.plan.environments]
     for environment in sorted(experiment.plan.environments, key=order.index):
         for task in experiment.plan.tasks:
             seeds = {run.cell.seed: run.rows for run in experiment.runs_of(task, environment)}
-            curves = seed_curves(seeds, metric, over)
+            curves = seed_curves(seeds, metric)
             if len(curves):
                 panels.setdefault(environment, {})[task] = curves
     return panels
 
 
-def seed_curves(seeds: dict[int, pd.DataFrame], metric: str, over: str) -> pd.DataFrame:
-    """Return a metric over steps or seconds, a column for each seed that has it, from the evaluations of seeds."""
+def seed_curves(seeds: dict[int, pd.DataFrame], metric: str) -> pd.DataFrame:
+    """Return a metric over millions of steps, a column for each seed that has it, from the evaluations of seeds."""
     columns = {}
     for seed, rows in seeds.items():
-        places = rows[over].astype(float) / AXES[over][0]
+        places = rows["steps"].astype(float) / MILLION
         columns[seed] = rows.set_axis(places)[metric].groupby(level=0).last()
     return pd.DataFrame(columns, dtype=float).dropna(how="all").dropna(how="all", axis=1)
 

@@ -224,7 +224,7 @@ def test_tables_of_the_page(text, page):
 def test_the_page_is_whole(report, page):
     """It refers to nothing but itself: pictures and videos are in it, byte by byte, links lead to its own headings."""
     source, files = (report / "report.html").read_text(), {file.read_bytes() for file in report.glob("*.png")}
-    assert len(files) == 7 and all(file.startswith(b"\x89PNG") for file in files)
+    assert len(files) == 6 and all(file.startswith(b"\x89PNG") for file in files)
     data = [reference.partition(",")[::2] for reference in page.references if reference.startswith("data:")]
     pictures = {base64.b64decode(content) for kind, content in data if kind == "data:image/png;base64"}
     assert pictures == files
