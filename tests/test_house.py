@@ -39,7 +39,7 @@ LINES = {
     "legged_torque/viewer": 2487,
     "scripts": 2045,
     "paper": 3047,
-    "tools": 1234,
+    "tools": 1230,
     "tests": 23_713,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""

@@ -12,6 +12,7 @@ Playground 1.0 since it no longer has a Go1.
 """
 
 import argparse
+import json
 import os
 import subprocess
 import sys
@@ -20,6 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from legged_torque.deploy.description import require
 from legged_torque.utils.cli import Parser, check_args, check_output, run_script
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
@@ -53,9 +55,9 @@ COLUMNS = {
 def main() -> None:
     """Run all rows one after the other, print a table, write JSON."""
     args = parse_args()
+    require("onnx", "onnxruntime", "jsonschema")  # for the judge of our policies
     device = resolve_device(args.device)
-    result: dict[str, Any] = {"device": device_name(device), "num_envs": args.num_envs, "seed": args.seed}
-    result |= {"rows": []}
+    result: dict[str, Any] = {"device": device_name(device), "num_envs": args.num_envs, "seed": args.seed, "rows": []}
     with tempfile.TemporaryDirectory() as folder:
         mjlab = args.mjlab or install(Path(folder, "venv"))
         for trainer, settings, engine in ROWS:
@@ -119,7 +121,7 @@ def run(
         print(*lines[-20:], f"This row has failed, with exit status {process.returncode}.", sep="\n", flush=True)
         return {"error": lines[-20:]}
     print(*(line for line in lines if line.startswith("  after")), sep="\n", flush=True)
-    return measure.read(out)
+    return json.loads(out.read_text(encoding="utf-8"))
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:

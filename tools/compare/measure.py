@@ -4,7 +4,6 @@ Both train the Go1 on a plane with position control, and both runners are rsl_rl
 """
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -134,8 +133,3 @@ def time_until_enough(recorder: Recorder, walkers: Iterator[tuple[int, Walker]],
         if share >= ENOUGH:
             return result | {"seconds_to_70": seconds, "steps_to_70": iterations * num_envs * NUM_STEPS}
     return result
-
-
-def read(file: Path) -> dict[str, Any]:
-    """Return what a side has written."""
-    return json.loads(file.read_text(encoding="utf-8"))
