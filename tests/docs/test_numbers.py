@@ -1,5 +1,6 @@
 """The tables of the documents, recomputed from the raw data beside them."""
 
+import json
 from itertools import product
 from pathlib import Path
 
@@ -239,3 +240,28 @@ def test_sweeps():
         ends.append(f"{tracking.min():.2f} to {tracking.max():.2f}")
     text = text_of("results.md", "## What policies bear")
     assert f"with 30 ms PD tracks {ends[0]}, torque multi-head {ends[1]} (" in text
+
+
+def test_performance():
+    """Times of training and its parts, and the comparison with mjlab."""
+    data = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
+    keys = ["physics_ms", "step_ms", "rollout_ms", "update_ms", "iteration_ms"]
+    for row, (_, worlds, *times, million, memory) in zip(
+        data[0]["rows"], rows_of("performance.md", "task | worlds")[1], strict=True
+    ):
+        assert int(worlds) == row["worlds"] and same(million, row["iteration_steps_per_s"] / 1e6)
+        assert all(same(text, row[key]) for text, key in zip(times, keys, strict=True)), row
+        assert same(memory, row["peak_memory_mib"] / 1024)
+    _, rows = rows_of("performance.md", "trainer | settings")
+    for row, (_, _, _, step, iteration, _, _, tracking) in zip(data[1]["rows"][:2], rows[:2], strict=True):
+        assert same(step, row["step_ms"]) and same(iteration, row["iteration_ms"])
+        assert same(tracking, row["tracking_after_iterations"][-1][2])
+
+
+def test_g1():
+    """The last 18% of four seeds."""
+    data = pd.read_csv(DOCS / "results" / "g1.csv").query("steps >= 0.82 * 2238 * 98304")
+    numbers = data.groupby("seed")["track_percentage"].mean()
+    text = text_of("robots.md", "## Results")
+    assert "{:.3f}, {:.3f}, {:.3f} and {:.3f}. In `low`".format(*numbers) in text and len(numbers) == 4
+    assert f"{numbers.min():.3f} to {numbers.max():.3f} (four seeds" in text
