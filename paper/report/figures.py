@@ -87,7 +87,7 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
     """Draw every figure that there are data for, as PNG, and return their titles."""
     from PIL import Image  # matplotlib needs it too
 
-    counts = {experiment.num_expected(run.cell.task, run.cell.environment) for run in experiment.runs} or {0}
+    counts = {len(experiment.runs_of(run.cell.task, run.cell.environment)) for run in experiment.runs} or {0}
     seeds = "–".join(map(str, sorted({min(counts), max(counts)})))
     conditions = f"{experiment.ranges()} ranges, {seeds} seed{'' if seeds == '1' else 's'}"
     pyplot, drawn = load_pyplot(), []
@@ -96,7 +96,7 @@ def draw_all(experiment: Experiment, figures: dict[str, Draw], out: Path) -> lis
             if (figure := draw()) is not None:
                 figure.suptitle(f"{title} ({conditions})", fontsize=11)
                 figure.savefig(stream := io.BytesIO(), format="png")
-                image = Image.open(stream).convert("RGB").quantize(COLOURS)
+                image = Image.open(stream).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
                 image.save(stream := io.BytesIO(), format="png", optimize=True)
                 write_whole(out / file_name(title), stream.getvalue())
                 pyplot.close(figure)
