@@ -144,7 +144,7 @@ def column_name(trained: str, evaluated: str) -> str:
 
 
 def is_of_paper(column: str) -> bool:
-    """Return whether a column is one of Table I."""
+    """Return whether a column is like those of Table I: policies are evaluated where they were trained, or doubled."""
     return " -> " not in column
 
 

@@ -148,7 +148,8 @@ def setup_lines(experiment: Experiment) -> list[str]:
     }
     lines = [f"Devices, as named in settings and results: {', '.join(devices) or 'unknown'}"]
     lines += [f"Versions: {text}" for text in sorted(versions) or ["unknown"]]
-    lines += filter(None, [describe(read_times(run.cell.folder) for run in experiment.runs)])
+    times = list(filter(None, (read_times(run.cell.folder) for run in experiment.runs)))
+    lines += [f"{len(times)} of {counted(len(experiment.runs), 'training')}: {describe(times)}"] if times else []
     ends = pd.DataFrame([run.rows.iloc[-1] for run in experiment.runs if len(run.rows)])
     ends = ends[ends["seconds"] > 0.0] if len(ends) else ends
     if len(ends):

@@ -11,7 +11,7 @@ from legged_torque.paper.metrics import COMPARED, PAPER_METRICS, Metric
 from legged_torque.paper.report.evaluations import CURVE_METRICS, METRIC_NAMES
 from legged_torque.paper.report.experiment import MEASURES, PAPER_STEPS, Experiment, is_of_paper
 from legged_torque.paper.report.style import in_words, method
-from legged_torque.paper.values import PAPER_TASKS, paper_value
+from legged_torque.paper.values import PAPER_TASKS, paper_value, task_on_plane
 from legged_torque.utils.config import flat
 
 Rows = list[list[str]]
@@ -27,8 +27,8 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
 
     Returns:
         A row for each column of the report's tables, task and metric (the index), with what :func:`estimate` returns,
-        ``is_final`` (whether all seeds are there and finished), ``is_compared`` (whether they walk), ``paper`` (the
-        mean in Table I, or NaN; also where nothing is compared) and ``sign`` (the :func:`verdict`, or nothing).
+        ``is_final`` (whether all seeds are there and finished), ``paper`` (the mean in Table I, or NaN; also where
+        nothing is compared, since they do not walk) and ``sign`` (the :func:`verdict`, or nothing).
     """
     rows = []
     for (column, (trained, evaluated)), task in product(experiment.columns().items(), experiment.plan.tasks):
@@ -44,7 +44,7 @@ def summarize(experiment: Experiment, from_step: float) -> pd.DataFrame:
             paper = paper_value(task, column, metric.name) if is_compared or not found["seeds"] else None
             sign = verdict(metric, found, paper) if metric in COMPARED and found["seeds"] and paper is not None else ""
             row = {"column": column, "task": task, "metric": metric.name, **found, "is_final": is_final}
-            rows.append(row | {"is_compared": is_compared, "paper": paper, "sign": sign})
+            rows.append(row | {"paper": paper, "sign": sign})
     return pd.DataFrame(rows).astype({"paper": float}).set_index(["column", "task", "metric"])
 
 
@@ -112,8 +112,8 @@ def find_differences(experiment: Experiment, table: pd.DataFrame) -> pd.DataFram
 
 
 def baseline_of(tasks: list[str]) -> str:
-    """Return the task that others are compared with: the first one with position control, or else the first one."""
-    return next((task for task in tasks if task.endswith("position") or "_position" in task), tasks[0])
+    """Return the baseline: the first task with position control, or else the first one. Settings follow a space."""
+    return next((task for task in tasks if task_on_plane(f"_{task.partition(' ')[0]}").endswith("_position")), tasks[0])
 
 
 def estimate_text(found: Any, form: str, planned: int | None = None) -> str:

@@ -98,12 +98,16 @@ def test_findings(table_one):
             found.setdefault(metric, []).append([task for task in different if is_up[task] == up])
         less[environment, metric] = {task: 1.0 - iqm(values[task]) / iqm(own) for task in others}
     curricula = ["a1_torque_curriculum", "a1_torque_curriculum_multihead"]
-    assert [*map(len, worse["track_percentage"])] == [6, 5, 2, 4] and not any(better["track_percentage"])
-    assert [*map(len, worse["track_xy"])] == [6, 6, 5, 6] and not any(better["track_xy"])
-    assert [*map(len, better["track_angular"])] == [5, 6, 3, 6] and not any(worse["track_angular"])
+    text, count = text_of("results.md", "# Results"), {key: sum(map(len, found)) for key, found in worse.items()}
+    numbers = [("no", "one", "two", "three", "four", "five", "six")[len(each)] for each in worse["track_percentage"]]
+    names = ("`low`, {} in `high`, {} in `high_frequency` and {} in `doubled`").format(*numbers[1:])
+    assert f"significantly better than {numbers[0]} of six in {names}" in text and not any(better["track_percentage"])
+    assert f"most exact, in {count['track_xy']} of 24 comparisons significantly" in text and not any(better["track_xy"])
+    exact = [*map(len, better["track_angular"])]
+    assert f"exactly than PD, in {sum(exact)} of 24 comparisons" in text and exact == [5, 6, 3, 6]
     assert better["cost_of_transport"] == [["a1_torque_multihead"], [], [], []]
     assert worse["cost_of_transport"] == [curricula, curricula, curricula[:1], []]
-    text, low, high = text_of("results.md", "# Results"), *(less[name, METRICS[-1]] for name in ("low", "high"))
+    low, high = (less[name, METRICS[-1]] for name in ("low", "high"))
     saved = [f"{each['a1_torque_multihead']:.0%}" for each in (low, high)]
     assert f"needs {saved[0]} less than PD in `low` and {saved[1]} less, not significantly, in `high`" in text
     assert f"Here it is {low['a1_multihead']:.0%}".rstrip("%") + f" (not significantly) and {saved[0]}" in text

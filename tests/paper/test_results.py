@@ -129,3 +129,5 @@ def test_comparisons():
     for values, paper, signs in (([0.6, 0.8], 0.5, "✓✗"), ([0.6, 0.8], 0.65, "≈≈"), ([0.6], 0.7, "✗✓")):
         assert "".join(verdict(PAPER_METRICS[i], estimate(values), paper) for i in (0, -1)) == signs
     assert baseline_of(["b", "a"]) == "b" and baseline_of(["b", "go_position_scan", "position"]) == "go_position_scan"
+    others = ["a1_torque rewards.scales.nominal_position=1", "a1_torque_position_penalty", "g1_decomposition"]
+    assert baseline_of([*others, "a1_position sim.dt=1"]) == "a1_position sim.dt=1"
