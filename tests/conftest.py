@@ -1,10 +1,17 @@
 """Fixtures of all tests: tasks on the CPU, small and seeded."""
 
 import contextlib
+import gc
 import os
+import sys
+import tempfile
+from pathlib import Path
 
 os.environ["MUJOCO_GL"] = "disable"  # before anything imports mujoco: no test renders
 os.environ["OMP_NUM_THREADS"] = "1"  # of scripts as well: a training in one process
+if sys.dont_write_bytecode:  # the processes that tests start, many, would all compile the same modules for seconds
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    os.environ["PYTHONPYCACHEPREFIX"] = os.path.join(tempfile.gettempdir(), "legged_torque_pycache")
 
 import pytest
 import torch
@@ -21,11 +28,27 @@ from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options
 
+LONGEST = Path(__file__).with_name("longest.txt").read_text("utf-8").split()
+"""Files that start first, so that no worker is left alone with one; the first two compile different kernels."""
+
 
 def pytest_configure(config):
     """Keep a record of the tests that need a GPU; with pytest-xdist, only its controller does."""
+    config.option.loadscopereorder = False  # of pytest-xdist: it would start files with many tests first
     if not hasattr(config, "workerinput"):
         config.pluginmanager.register(Recorder(config))
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first."""
+    order = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: order.get(item.nodeid.removeprefix("tests/").partition(".py")[0], len(order)))
+
+
+def pytest_collection_finish():
+    """Spare the garbage collector what has been imported, which stays: it would go through it again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)
