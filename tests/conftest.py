@@ -51,6 +51,11 @@ def pytest_collection_finish():
     gc.freeze()
 
 
+def pytest_unconfigure():
+    """Let the end of the process find everything: Triton complains of what is left."""
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def current_dir(tmp_path_factory):
     """Where tests run: a temporary folder, so that logs and MuJoCo's MUJOCO_LOG.TXT do not land in the repository."""
