@@ -10,7 +10,7 @@ from support.scripts import ROOT
 
 def test_first_steps(tmp_path, monkeypatch):
     """It trains, and shows a curve and a video; in the repository it has no outputs."""
-    few = "--num_envs 32 --max_iterations 2 --set evaluation.at_end=false --device cpu"
+    few = "--num_envs 2 --max_iterations 2 --set evaluation.at_end=false --device cpu"
     notebook = nbformat.read(ROOT / "examples" / "first_steps.ipynb", as_version=4)
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells)
     tagged = {tag: cell for cell in notebook.cells for tag in cell.metadata.get("tags", ())}
