@@ -1,7 +1,6 @@
 """Fixtures of all tests: tasks on the CPU, small and seeded."""
 
 import contextlib
-import gc
 import os
 import sys
 import tempfile
@@ -43,17 +42,6 @@ def pytest_collection_modifyitems(items):
     """Put the longest files first."""
     order = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: order.get(item.nodeid.removeprefix("tests/").partition(".py")[0], len(order)))
-
-
-def pytest_collection_finish():
-    """Spare the garbage collector what has been imported, which stays: it would go through it again and again."""
-    gc.collect()
-    gc.freeze()
-
-
-def pytest_unconfigure():
-    """Let the end of the process find everything: Triton complains of what is left."""
-    gc.unfreeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2045,
     "paper": 3042,
     "tools": 1230,
-    "tests": 23_803,
+    "tests": 23_791,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 31_630  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
