@@ -79,6 +79,7 @@ class Matrix:
     tasks: list[str]
     environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
+    preset: str = ""  # of the trainings, as --preset takes it; empty: the default
     ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
     train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, Any] = field(default_factory=dict)  # as EVALUATION
@@ -100,6 +101,12 @@ class Matrix:
         """Return the lists that make up the cells, by their keys."""
         evaluated = {f"environments.{name}": names for name, names in self.environments.items()}
         return {"tasks": self.tasks, "seeds": self.seeds, "environments": list(self.environments), **evaluated}
+
+    def settings(self) -> dict[str, Any]:
+        """Return what all cells share and what is set, by dotted path."""
+        named = {name: value for name in ("preset", "ranges") if (value := getattr(self, name))}
+        sections = {name: getattr(self, name) for name in ("train", "evaluation", "grounds", "sweeps")}
+        return named | {f"{name}.{key}": value for name, values in sections.items() for key, value in values.items()}
 
     def set_words(self, sweep: str = "") -> list[str]:
         """Return the changed settings of the trainings as ``--set`` takes them, or those of a sweep."""
@@ -152,8 +159,9 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     rising_levels(matrix.grounds.get("levels", []))
     of_tasks = {}
     for cell in matrix.cells(Path()):
-        ranges, words = str(matrix.ranges) if matrix.ranges else None, matrix.set_words()
-        options = Options(device="cpu", seed=cell.seed, perturbation=cell.environment, ranges=ranges, set=words)
+        words = matrix.set_words()
+        options = Options(device="cpu", seed=cell.seed, preset=matrix.preset, ranges=matrix.ranges, set=words)
+        options.perturbation = cell.environment
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
         for name in cell.evaluated_in:
@@ -205,12 +213,11 @@ def check_same(matrix: Matrix, out: Path) -> None:
     if not (out / SETTINGS_FILE).is_file():
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
-    for section in ("train", "evaluation", "grounds", "sweeps"):
-        was, now = getattr(old, section), getattr(matrix, section)
-        for key in sorted(was.keys() | now.keys()):
-            if was.get(key) != now.get(key):
-                texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
-                raise UserError(f"{differs}: {section}.{key} is {texts}; give another --out")
+    was, now = old.settings(), matrix.settings()
+    for key in sorted(was.keys() | now.keys()):
+        if was.get(key) != now.get(key):
+            texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
+            raise UserError(f"{differs}: {key} is {texts}; give another --out")
     for key, values in old.lists().items():
         lost = [str(value) for value in values if value not in matrix.lists().get(key, [])]
         if lost:
@@ -238,7 +245,8 @@ def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> lis
     also = [name for name in cell.evaluated_in if name != cell.environment]
     words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
     words.append("--set=evaluation.at_end=False")  # those are short: without others, the last checkpoint is measured
-    return ["train.py", *words, *([f"--ranges={matrix.ranges}"] if matrix.ranges else [])]
+    named = {"preset": matrix.preset, "ranges": matrix.ranges}
+    return ["train.py", *words, *(f"--{name}={value}" for name, value in named.items() if value)]
 
 
 def command_of(words: list[str]) -> list[str]:

@@ -167,14 +167,19 @@ class Evaluation(Protocol):
         """Return the present levels of the curricula of the training's ground."""
 
 
+def check_methods(learner: type) -> None:
+    """Raise a UserError if a class lacks methods of a :class:`Learner`."""
+    methods = (name for name in [*vars(Learner), *vars(Stateful)] if not name.startswith("_"))
+    if missing := [name for name in methods if not callable(getattr(learner, name, None))]:
+        raise UserError(f"algorithm.class_name: {learner.__name__} is no learner, it lacks {', '.join(missing)}")
+
+
 def check_learner(alg: Any, env: Any, num_processes: int) -> None:
     """Raise a UserError if an object is no :class:`Learner`, or needs what the task or several processes lack."""
+    check_methods(type(alg))
     name = type(alg).__name__
-    methods = [*vars(Learner), *vars(Stateful)]
-    members = [*Learner.__annotations__, *(name for name in methods if not name.startswith("_"))]
-    missing = [member for member in members if not hasattr(alg, member)]
-    if missing:
-        raise UserError(f"algorithm.class_name: {name} is no learner, it lacks {', '.join(missing)}")
+    if missing := [attribute for attribute in Learner.__annotations__ if not hasattr(alg, attribute)]:
+        raise UserError(f"{name} lacks {', '.join(missing)}")
     if alg.needs_next_obs and not hasattr(env, "keep_final_observations"):
         raise UserError(f"{name} needs observations before resets, which {type(env).__name__} does not keep")
     if num_processes > 1 and not hasattr(alg, "broadcast_parameters"):

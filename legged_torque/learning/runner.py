@@ -4,10 +4,12 @@ from typing import Any
 
 import torch
 from rsl_rl import runners
+from rsl_rl.utils import resolve_callable
 from torch import nn
 
 import legged_torque
 from legged_torque.learning.memory import acting
+from legged_torque.learning.protocols import check_methods
 from legged_torque.learning.trainer import Trainer
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
@@ -27,6 +29,7 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
         processes that train together do not find each other.
         """
         torch.set_float32_matmul_precision("high")  # TF32 on a GPU
+        check_methods(resolve_callable(train_cfg["algorithm"]["class_name"]))  # not rsl_rl's PPO, for instance
         groups_of_task = list(map(str, env.get_observations().keys()))
         for key, groups in train_cfg["obs_groups"].items():
             for group in groups or [""]:

@@ -33,15 +33,16 @@ def trained(stage):
 
 def test_order_and_commands(stage, tmp_path):
     """A seed comes before the next one; the scripts get the options of the cell and of the file."""
-    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}, "ranges": "hard"}
+    values = SMALL | {"seeds": [3, 1], "environments": {"low": ["low", "high"], "high": ["high"]}}
+    values |= {"ranges": "hard", "preset": "thorough"}
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert (status, error) == (0, "")
     cells = [f"{task}-{name}-s{seed}" for seed in (3, 1) for name in ("low", "high") for task in SMALL["tasks"]]
     assert trained(stage) == cells and (out / "experiment.yaml").read_bytes() == file.read_bytes()
     log = (out / "a1_torque-high-s3" / "train.log").read_text()
-    words = "--task=a1_torque --seed=3 --perturbation=high --set=runner.total_steps=128 --ranges=hard --device=cpu"
-    assert set(words.split()) <= set(log.splitlines()[0].split())
+    words = "--task=a1_torque --seed=3 --perturbation=high --set=runner.total_steps=128 --device=cpu"
+    assert {*words.split(), "--ranges=hard", "--preset=thorough"} <= set(log.splitlines()[0].split())
     result = json.loads((out / "a1_torque-low-s3" / "result_high.json").read_text())
     assert (result["perturbation"], result["num_envs"], result["steps"]) == ("high", "256", "2000")
     assert output.count("training on cpu took") == 8 and output.count("evaluation in") == 12
@@ -131,6 +132,7 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
     [
         ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
         ({"train": {}}, "train.runner.total_steps is not set, was 128"),
+        ({"ranges": "hard"}, "ranges is hard, was not set"),
         ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
     ],
 )

@@ -5,6 +5,7 @@ import copy
 import torch
 from rsl_rl.modules import MLP
 from support.point_masses import PointMasses, assert_holds_points, make_trainer
+from support.runners import build_runner
 from support.settings import error_of
 
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
@@ -138,11 +139,13 @@ def test_two_and_two_are_four(tmp_path):
         assert whole[name].keys() and all(torch.equal(value, resumed[name][key]) for key, value in whole[name].items())
 
 
-def test_what_does_not_fit_is_refused():
+def test_what_does_not_fit_is_refused(make_task):
     """The lines name the learner, the task and what is missing."""
     deaf = type("Deaf", (TDLearner,), {"observe": property()})
     message = error_of(make_trainer, deaf)
     assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
+    message = error_of(build_runner, make_task, "a1_torque", **{"algorithm.class_name": "PPO"})  # rsl_rl's own
+    assert message.endswith(": PPO is no learner, it lacks observe, due, policy, state_dict, load_state_dict")
     forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
     message = error_of(make_trainer, TDLearner, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"
