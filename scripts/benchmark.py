@@ -31,7 +31,6 @@ COLUMNS = {
     "update_ms": ("update ms", 1),
     "log_ms": (" log ms", 1),
     "iteration_ms": ("iteration ms", 1),
-    "iteration_over_physics": ("x floor", 2),
     "iteration_steps_per_s": ("steps/s", 0),
     "peak_memory_mib": ("peak MiB", 0),
     "startup_s": ("start-up s", 1),
@@ -39,8 +38,7 @@ COLUMNS = {
 """Heading of each column, as wide as the column, and its number of decimals."""
 LEGEND = """\
   physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
-  x floor: iteration / (physics x control steps of a rollout); steps/s: over whole iterations
-  peak: {memory}
+  steps/s: over whole iterations; peak: {memory}
   start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""
 
 

@@ -190,7 +190,7 @@ def seconds_per_call(function: Callable[[], object], device: str) -> float:
 
 
 def summarize(times: Times, physics: float, step: float, num_envs: int, num_steps: int) -> dict[str, Any]:
-    """Return medians [ms], steps per second, and ratios to physics alone; ``num_steps`` are those of a rollout."""
+    """Return medians [ms] and steps per second; ``num_steps`` are those of a rollout."""
     medians = {"physics": physics, "step": step} | {name: median(values) for name, values in times.items()}
     return {
         "num_envs": num_envs,
@@ -198,7 +198,6 @@ def summarize(times: Times, physics: float, step: float, num_envs: int, num_step
         **{f"{name}_ms": value for name, value in medians.items()},
         "iteration_min_ms": min(times["iteration"]),
         "iteration_max_ms": max(times["iteration"]),
-        "iteration_over_physics": medians["iteration"] / (physics * num_steps),
         "iteration_steps_per_s": _MS * num_envs * num_steps / medians["iteration"],
     }
 

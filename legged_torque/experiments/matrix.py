@@ -12,6 +12,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
+from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options, draw_only
@@ -103,10 +104,9 @@ class Matrix:
         return {"tasks": self.tasks, "seeds": self.seeds, "environments": list(self.environments), **evaluated}
 
     def settings(self) -> dict[str, Any]:
-        """Return what all cells share and what is set, by dotted path."""
-        named = {name: value for name in ("preset", "ranges") if (value := getattr(self, name))}
-        sections = {name: getattr(self, name) for name in ("train", "evaluation", "grounds", "sweeps")}
-        return named | {f"{name}.{key}": value for name, values in sections.items() for key, value in values.items()}
+        """Return what is set for all cells, by dotted path."""
+        shared = ("preset", "ranges", "train", "evaluation", "grounds", "sweeps")
+        return flat({name: value for name, value in vars(self).items() if name in shared and value})
 
     def set_words(self, sweep: str = "") -> list[str]:
         """Return the changed settings of the trainings as ``--set`` takes them, or those of a sweep."""
@@ -214,10 +214,9 @@ def check_same(matrix: Matrix, out: Path) -> None:
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
     was, now = old.settings(), matrix.settings()
-    for key in sorted(was.keys() | now.keys()):
-        if was.get(key) != now.get(key):
-            texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
-            raise UserError(f"{differs}: {key} is {texts}; give another --out")
+    for key in sorted(key for key in was.keys() | now.keys() if was.get(key) != now.get(key)):
+        texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
+        raise UserError(f"{differs}: {key} is {texts}; give another --out")
     for key, values in old.lists().items():
         lost = [str(value) for value in values if value not in matrix.lists().get(key, [])]
         if lost:

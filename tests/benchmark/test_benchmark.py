@@ -49,7 +49,6 @@ def test_numbers_belong_together(measured):
     for row in result["rows"]:
         assert all(row[f"{name}_ms"] > 0 for name in (*PARTS, "physics", "step", "iteration"))
         assert row["iteration_steps_per_s"] == pytest.approx(row["num_envs"] * 3 / (row["iteration_ms"] / 1000))
-        assert row["iteration_over_physics"] == pytest.approx(row["iteration_ms"] / (3 * row["physics_ms"]))
         assert row["iteration_min_ms"] <= row["iteration_ms"] <= row["iteration_max_ms"]
         # with two rounds medians are means, which add up
         assert sum(row[f"{name}_ms"] for name in PARTS) == pytest.approx(row["iteration_ms"])
