@@ -38,8 +38,8 @@ def main() -> None:
         import torch
 
         from legged_torque.viewer.native import check_display
-    no_window: list[str] = []
-    with collect_errors(no_window):
+    window: list[str] = []
+    with collect_errors(window):
         check_display("--viewer web")
     topics = {
         f"legged_torque {legged_torque.__version__}": [f"in {Path(legged_torque.__file__).parent}"],
@@ -48,10 +48,8 @@ def main() -> None:
         "GPU": gpus(),
         "caches": caches(),
         "extras": extras(),
-        "rendering": [
-            f"videos: {no_renderer or os.environ['MUJOCO_GL']}",
-            f"MuJoCo's window: {' '.join(no_window) or 'ok'}",
-        ],
+        "videos": [no_renderer or os.environ["MUJOCO_GL"]],
+        "MuJoCo's window": window or ["ok"],
     }
     for title, lines in topics.items():
         print(title, *lines, sep="\n  ")
@@ -74,21 +72,15 @@ def gpus() -> list[str]:
 
 
 def caches() -> list[str]:
-    """Return the folder of compiled kernels, with its number of modules and its size."""
+    """Return the folder of compiled kernels, with its number of modules."""
     import warp as wp
 
     import legged_torque.sim  # noqa: F401 (lets Warp print no banner)
 
     wp.init()
     folder = Path(wp.config.kernel_cache_dir or "")
-    modules, size = sum(1 for path in folder.glob("wp_*")), size_of(folder) / 2**20
-    return [f"compiled kernels: {folder}, {counted(modules, 'module')}, {size:.0f} MiB; WARP_CACHE_PATH chooses it"]
-
-
-def size_of(folder: Path) -> int:
-    """Return the size of all files in a folder [bytes]; those that another process moves meanwhile may be left out."""
-    files = (Path(place, name) for place, _, names in os.walk(folder) for name in names)
-    return sum(file.lstat().st_size for file in files if os.path.lexists(file))
+    modules = counted(len([*folder.glob("wp_*")]), "module")
+    return [f"compiled kernels: {folder}, {modules}; WARP_CACHE_PATH chooses it"]
 
 
 def extras() -> list[str]:

@@ -35,15 +35,15 @@ LINES = {
     "legged_torque/sensors": 302,
     "legged_torque/sim": 5741,
     "legged_torque/terrain": 591,
-    "legged_torque/utils": 3209,
+    "legged_torque/utils": 3212,
     "legged_torque/viewer": 2487,
-    "scripts": 2043,
+    "scripts": 2035,
     "paper": 3042,
     "tools": 1230,
     "tests": 23_819,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 31_641  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_636  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

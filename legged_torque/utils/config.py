@@ -31,13 +31,16 @@ class Section:
 
     _mistakes: ClassVar[dict[str, str]] = {}
     """What is wrong with names of this class and of its sections, by dotted path."""
+    _names: ClassVar[list[str]] = []
+    """Names of settings and sections, found once: hundreds of instances are made at each start."""
 
     def __init_subclass__(cls) -> None:
         """Keep mistakes in the names of a new class, and let its nested classes inherit."""
         super().__init_subclass__()
         cls._mistakes = {path: text for base in cls.__bases__ for path, text in getattr(base, "_mistakes", {}).items()}
         cls._mistakes |= _find_mistakes(cls)
-        for name in _entries(cls):
+        cls._names = _entries(cls)
+        for name in cls._names:
             if not inspect.isclass(getattr(cls, name)):
                 continue
             values = (getattr(owner, name, None) for owner in (cls, *cls.__bases__))
@@ -52,7 +55,7 @@ class Section:
 
     def __init__(self) -> None:
         """Instantiate the nested sections, all the way down."""
-        for key in _entries(type(self)):
+        for key in self._names:
             value = getattr(self, key)
             if inspect.isclass(value):
                 value = value()
