@@ -14,6 +14,7 @@ if sys.dont_write_bytecode:  # the processes that tests start, many, would all c
 
 import pytest
 import torch
+import warp
 import yaml
 
 if not torch.cuda.is_available():
@@ -26,6 +27,9 @@ from support.last_run import Recorder
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.options import Options
+
+for part in ("derivative", "forward", "passive", "sensor", "smooth"):  # large ones, for few and short simulations
+    warp.get_module(f"mujoco_warp._src.{part}").options["optimization_level"] = 0  # half of the time to compile them
 
 LONGEST = Path(__file__).with_name("longest.txt").read_text("utf-8").split()
 """Files that start first, so that no worker is left alone with one; the first two compile different kernels."""

@@ -16,8 +16,10 @@ BALL = """<mujoco><compiler angle="radian" autolimits="true"/>
  <geom name="ball" type="{kind}" size="{size}" mass="2" contype="1" conaffinity="15" condim="3" friction="1e-5"/>{fill}
  <body><joint axis="1 0 0" range="-9 9" damping="0.01"/><inertial pos="0 0 0" mass="0.01" diaginertia="1e-3 1e-3 1e-3"/>
  </body></body></worldbody></mujoco>"""
-# Two tiny spheres in a sphere make up for a capsule's points, so that one kernel simulates both:
+# Tiny geoms inside give all kinds as many points and the code of cylinders, so that one kernel simulates them all:
 FILL = '<geom size="1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
+DISC = '<geom type="cylinder" size="1e-3 1e-3" mass="0" contype="1" conaffinity="15" condim="3"/>'
+FILLS = {"sphere": DISC + 11 * FILL, "capsule": DISC + 6 * FILL, "cylinder": 12 * FILL, "box": DISC}
 FLAT = '<geom name="floor" type="plane" size="0 0 1" contype="15" conaffinity="1" friction="{friction}"/>'
 
 
@@ -51,8 +53,7 @@ def ball(friction=1e-5, kind="sphere", size="0.1", planes=()):
         for quat in planes
     )
     floors = posed or FLAT.format(friction=friction)
-    fill = 2 * FILL if kind == "sphere" else ""
-    spec = mujoco.MjSpec.from_string(BALL.format(floors=floors, kind=kind, size=size, fill=fill))
+    spec = mujoco.MjSpec.from_string(BALL.format(floors=floors, kind=kind, size=size, fill=FILLS[kind]))
     if not planes:
         return compiled(spec)
     model = spec.compile()
