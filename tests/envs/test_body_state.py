@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.fused import compiled, draw_states, make_walker, put
+from support.fused import compiled, draw_states, make_crab, put
 from support.published import read_robot
 from support.settings import error_of
 
@@ -19,8 +19,8 @@ def make_jointed():
     return read_robot("jointed")
 
 
-ROBOTS = {"walker": (make_walker, "fused"), "jointed": (make_jointed, "mujoco_warp")}
-FEET = {"walker": (["Lfoot", "Rshin", "Rfoot"], [0, 1, 2]), "jointed": (["upper", "palm", "thumb"], [0, 1, 1])}
+ROBOTS = {"crab": (make_crab, "fused"), "jointed": (make_jointed, "mujoco_warp")}
+FEET = {"crab": (["foot", "thigh", "tyre"], [0, 1, 2]), "jointed": (["upper", "palm", "thumb"], [0, 1, 1])}
 """Geoms that stand for feet, and the foot of each."""
 LONGER = (0.1, 0.2, 0.3)
 """How much farther the last body is from its parent in world 3 [m]."""
@@ -39,6 +39,7 @@ def moving(request):
     if engine == "fused":  # parameters per world need one hinge per body
         longer[3] = LONGER
         sim.field("body_pos")[:, -1] += torch.tensor(longer)
+        sim.applied_forces()  # whose kernel test_fused.py needs as well
     put(sim, states)
     sim.step()
     after = {"qpos": sim.qpos.numpy(), "qvel": sim.qvel.numpy()}

@@ -40,7 +40,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def killed(tmp_path_factory):
     """A smoke experiment that was killed in the middle of its training: its file, its folder, its output."""
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
-    values["train"] |= {"runner.total_steps": 40 * 32, "runner.save_interval": 2}
+    values["train"] |= {"runner.total_steps": 16 * 32, "runner.save_interval": 2}
     values |= {"tasks": ["a1_torque_multihead"], "environments": {"low": ["high"]}}
     tmp_path = tmp_path_factory.mktemp("killed")
     file, out = write(tmp_path / "smoke.yaml", values), tmp_path / "out"
@@ -79,12 +79,12 @@ def test_killed_in_the_middle_of_training(finished):
     _, out, _ = finished
     first, second = sorted(path for path in (out / "a1_torque_multihead-low-s1").iterdir() if path.is_dir())
     last = max(checkpoint_numbers(first))
-    assert 2 <= last < 40
-    state = torch.load(second / "model_40.pt", weights_only=True)
-    assert (state["iter"], state["infos"]["total_timesteps"]) == (40, 40 * 32)
-    assert yaml.safe_load((second / "config.yaml").read_text())["max_iterations"] == 40
+    assert 2 <= last < 16
+    state = torch.load(second / "model_16.pt", weights_only=True)
+    assert (state["iter"], state["infos"]["total_timesteps"]) == (16, 16 * 32)
+    assert yaml.safe_load((second / "config.yaml").read_text())["max_iterations"] == 16
     events = EventAccumulator(str(second)).Reload()
-    assert [event.step for event in events.Scalars("Loss/value")] == list(range(last, 40))
+    assert [event.step for event in events.Scalars("Loss/value")] == list(range(last, 16))
 
 
 def test_smoke_experiment_runs_to_the_end(finished):
@@ -93,9 +93,9 @@ def test_smoke_experiment_runs_to_the_end(finished):
     cell = out / "a1_torque_multihead-low-s1"
     result = json.loads((cell / "result_high.json").read_text())
     assert (result["task"], result["perturbation"]) == ("a1_torque_multihead", "high")
-    assert (result["checkpoint"], result["num_envs"], result["num_steps"]) == ("model_40.pt", 4, 20)
+    assert (result["checkpoint"], result["num_envs"], result["num_steps"]) == ("model_16.pt", 4, 20)
     log = (cell / "train.log").read_text()
-    assert log.count("scripts/train.py") == 2 and log.count(" --resume") == 1 and "iteration 40 of 40, " in log
+    assert log.count("scripts/train.py") == 2 and log.count(" --resume") == 1 and "iteration 16 of 16, " in log
     assert f"{cell.name}: evaluation in high on cpu took" in output and not list(cell.glob("*.part"))
     assert "1 of 1 cells done" in output and output.endswith("1 of 1 cells are done.\n")
 
@@ -108,7 +108,7 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert (status, error, contents(out)) == (0, "", before)
     first, spent, last = output.splitlines()
     assert (first, last) == (f"1 of 1 cells are done in {out}", "1 of 1 cells are done.")
-    assert " of CPU time for training; 1280 steps of training, " in spent
+    assert " of CPU time for training; 512 steps of training, " in spent
 
 
 CELLS = {"paper": 210, "hard": 28, "low": 12, "smoke": 2, "rough": 16, "robustness": 25}

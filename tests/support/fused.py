@@ -23,20 +23,17 @@ def make_a1(edit=None):
     return spec
 
 
-def make_walker():
-    """Two legs with four joints each, off their bodies' origins and about odd axes; one joint has no motor."""
-    return read_robot("walker")
-
-
 def make_crab():
     """Five branches of one, two and three joints, some without motors or ranges; cylinders and fixed bodies on both.
+
+    Joints are off their bodies' origins and about odd axes, with springs and references.
 
     Its settings differ from those of the fused step, but change no motion, and one geom passes through the floor.
     """
     return read_robot("crab")
 
 
-ROBOTS = {"a1": make_a1, "walker": make_walker, "crab": make_crab}
+ROBOTS = {"a1": make_a1, "crab": make_crab}
 
 
 def compiled(spec):
