@@ -62,7 +62,7 @@ class TestMuJoCoWarp(EngineSuite):
     def test_full_buffers_are_reported(self, monkeypatch, buffer, size, name):
         """A buffer that is too small in one world is named, even after that world has been reset."""
         monkeypatch.setattr(mjwarp, buffer, lambda *_: size)
-        sim = self.make(2, iterations=(5, 8))
+        sim = self.make(2)
         put_deep_into_the_floor(sim)
         sim.qpos[:, 2], sim.qpos[:, 7:] = 10.0, torch.tensor(LEG_UP * 4)
         sim.step()

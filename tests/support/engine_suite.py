@@ -44,7 +44,7 @@ class EngineSuite:
     height: tuple[float, float] = (0.1, 0.3)
     """Heights of trunks [m] from which all contacts are MuJoCo's."""
 
-    def make(self, num_envs, model=None, iterations=(30, 20)):
+    def make(self, num_envs, model=None, iterations=(30, 50)):
         """Worlds of the A1, or another robot."""
         return make_engine(self.engine, compiled(make_a1()) if model is None else model, num_envs, "cpu", *iterations)
 
@@ -53,7 +53,7 @@ class EngineSuite:
         if capability not in ENGINES[self.engine].capabilities:
             pytest.skip(f"{self.engine} lacks {capability}")
 
-    def scattered(self, num_envs, seed=3, lowest=0.2, iterations=(30, 20)):
+    def scattered(self, num_envs, seed=3, lowest=0.2, iterations=(30, 50)):
         """Worlds in different states: low and high, bent and moving."""
         sim, generator = self.make(num_envs, None, iterations), torch.Generator().manual_seed(seed)
         home = torch.tensor(sim.mj_model.key_qpos[0], dtype=torch.float32)
@@ -63,29 +63,27 @@ class EngineSuite:
         sim.qvel.copy_(0.3 * torch.randn(num_envs, 18, generator=generator))
         return sim
 
-    @pytest.mark.parametrize(("resync", "looser"), [(1, 1.0), (5, 3.0)])
-    def test_matches_plain_mujoco(self, resync, looser):
+    def test_matches_plain_mujoco(self):
         """Over 200 steps of random torques every world moves as plain MuJoCo does from the same state.
 
-        The reference starts anew from the world's state every ``resync`` steps. The tolerance is for the worst step,
-        when contacts begin or slip. Positions must agree to the tolerance times the physics step, contacts exactly,
-        their forces to 1%.
+        The reference starts anew from the world's state with every step. The tolerance is for the worst step, when
+        contacts begin or slip. Positions must agree to the tolerance times the physics step, contacts exactly, their
+        forces to 1%.
         """
-        tolerance, generator = looser * self.tolerance, torch.Generator().manual_seed(2)
+        tolerance, generator = self.tolerance, torch.Generator().manual_seed(2)
         sim = self.scattered(4, iterations=(100, 50))
         model, references = sim.mj_model, [mujoco.MjData(sim.mj_model) for _ in range(4)]
-        errors, in_contact, comparable = [], 0, [True] * 4
+        errors, in_contact = [], 0
         for step in range(200):
             sim.ctrl.copy_(8.0 * torch.randn(sim.ctrl.shape, generator=generator).clamp(-4.0, 4.0))
             for world, data in enumerate(references):
-                if step % resync == 0:
-                    data.qpos[:], data.qvel[:], comparable[world] = sim.qpos[world], sim.qvel[world], True
-                data.ctrl[:] = sim.ctrl[world]
+                data.qpos[:], data.qvel[:], data.ctrl[:] = sim.qpos[world], sim.qvel[world], sim.ctrl[world]
                 mujoco.mj_step(model, data)
-                comparable[world] &= self.engine != "mujoco_warp" or not steep_capsule_touches(model, data)
             sim.step()
-            for world in np.flatnonzero(comparable):
-                data, where = references[world], f"step {step}, world {world}"
+            for world, data in enumerate(references):
+                if self.engine == "mujoco_warp" and steep_capsule_touches(model, data):
+                    continue
+                where = f"step {step}, world {world}"
                 in_contact += data.ncon > 0
                 errors.append(np.abs(sim.qvel[world].numpy() - data.qvel).max())
                 assert errors[-1] <= tolerance, where
