@@ -60,8 +60,8 @@ def read_yaml(folder):
 
 
 TWO_RATES = "a1_multihead_two_rates"
-PARITY = [(name, settings) for name in [*TASKS, TWO_RATES] for settings in ("default", "changed")]
-MORE_PARITY = [("a1_torque_multihead", settings) for settings in SETTINGS if settings not in ("default", "changed")]
+PARITY = [(name, "changed") for name in [*TASKS, TWO_RATES]] + [(TWO_RATES, "default")]
+MORE_PARITY = [("a1_torque_multihead", settings) for settings in SETTINGS if settings != "changed"]
 
 
 @pytest.mark.parametrize(("name", "settings"), [*PARITY, *MORE_PARITY])

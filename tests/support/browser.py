@@ -22,7 +22,7 @@ from selenium import webdriver
 OPTIONS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
     "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
-    "--window-size=900,600 --force-device-scale-factor=0.5"  # of four pixels one is drawn
+    "--webgl-antialiasing-mode=none --window-size=900,600 --force-device-scale-factor=0.25"  # of 16 pixels one is drawn
 )
 
 

@@ -31,7 +31,7 @@ with TrainingDisplay("a1_torque: 9 worlds on CPU", "/logs/" + "[b]" * 40, 20, 0,
             tracked = {"Evaluation/track_percentage": i / 40, "Evaluation/falls_per_minute": 1.5} if i % 2 else {}
             display.add_iteration(i, 9 * i, numbers | tracked)
             print("ready" if i == 2 else "", end="\\n" if i == 2 else "", flush=True)
-            time.sleep(0.06)
+            time.sleep(0.03)
             if stop.requested:
                 time.sleep(1.2)
                 break

@@ -252,7 +252,7 @@ def test_recording_without_a_renderer(opened, page):
 
 def test_phone(opened):
     """The sheet is as wide as the page; the plots, at its top, can be unfolded; both robots are above it."""
-    with screen(opened, 390, 844, 0.5, mobile=True):
+    with screen(opened, 390, 844, 0.25, mobile=True):
         open_page(opened, opened.current_url)
         sheet = wait_for(lambda: opened.find_element(By.CSS_SELECTOR, "[style*='max-height: 60%']"))
         wait_for(lambda: sheet.size["width"] == 390)
