@@ -54,11 +54,12 @@ def test_two_and_two_are_four(half, tmp_path):
 
 OTHERS = {
     "mujoco_warp": ["--set=sim.engine=mujoco_warp", "--set=evaluation.interval=0"],
-    "hard": ["--set=evaluation.interval=1000", "--ranges=hard", "--set=domain_rand.push_probability=0.5", "--set=domain_rand.resampling_probability=0.5"],
+    "hard": ["--ranges=hard", "--set=domain_rand.push_probability=0.5", "--set=domain_rand.resampling_probability=0.5"],
     "rough": ["--task=a1_rough_torque_multihead_scan", "--set=terrain.num_rows=3"],
 }
 OTHERS["two rates"] = ["--task=a1_multihead_two_rates", "--set=runner.num_steps_per_env=3"]  # ends within intervals
 OTHERS["two rates"] += ["--set=env.history_length=1", "--set=evaluation.interval=0"]
+OTHERS["hard"] += ["--set=evaluation.interval=1000"]  # evaluated at the ends
 OTHERS["rough"] += ["--set=terrain.max_init_terrain_level=2", "--set=terrain.border_size=1"]
 OTHERS["rough"] += ["--set=motors.delay.unit=control_steps", "--set=control.refresh_torques=false"]  # a shared kernel
 

@@ -32,7 +32,7 @@ NAMES = (
 
 @pytest.mark.parametrize("setting", NAMES)
 def test_names_in_a_run(run, harm, setting):
-    """A class or function that no registered task names is refused before it is imported, one of them by all scripts."""
+    """A class or function that no registered task names is refused before it is imported; one, by all scripts."""
     edit_config(run, **{setting.replace(".", "__"): "payload:run"})
     before = contents(run.parents[2])
     for script in LOADING if setting == NAMES[0] else ("evaluate.py",):

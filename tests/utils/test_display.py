@@ -43,25 +43,6 @@ ENDLESS = TRAINING.replace("20, 0, 9", "9999, 0, 9").replace("range(1, 21)", "ra
 LARGE, SMALL = "a_term_with_a_very_long_name", "small_term"
 TERMS = {f"Episode_Reward/{SMALL}": 1e-4} | {f"Episode_Reward/{LARGE}_{i}": -0.0311 - i for i in range(20)}
 """Numbers of rewards; the last is the largest."""
-COUNTING = """
-import threading
-from legged_torque.utils.display import Counter, Display
-drawn = threading.Event()
-class Watched(Counter):
-    def view(self):
-        drawn.set()
-        return super().view()
-with Watched("rendering, frame", 4) as counter:
-    for _ in range(4):
-        counter.activity = "all is well"
-        counter.add()
-    drawn.clear()
-    assert drawn.wait(120)
-    assert Display.shown is counter
-    with Counter("inner", 2) as inner:  # another view would cover the first one
-        inner.add()
-assert Display.shown is None
-"""
 BROKEN = """
 import sys
 from legged_torque.utils.display import Counter
@@ -143,15 +124,6 @@ def test_a_terminal_that_closes():
     """It asks to stop, and what is drawn and printed afterwards harms nothing."""
     code = ENDLESS.replace("sys.exit(stop.number)", "sys.exit(100 + stop.number)")
     assert in_a_terminal(code, after="ready", close=True)[0] == 100 + signal.SIGHUP
-
-
-def test_counter_on_a_terminal():
-    """A bar that is gone in the end; a counter inside of it has none."""
-    status, output = in_a_terminal(COUNTING, columns=60)
-    lines = lines_of(output)
-    assert status == 0 and any(re.match(r"rendering, frame 4 of 4 ━+ 100% 0:\d\d:\d\d, 0:00:00 left", x) for x in lines)
-    assert "all is well" in output and "inner" not in output
-    assert output.rstrip().endswith("\033[2K")  # erased
 
 
 def test_errors():
