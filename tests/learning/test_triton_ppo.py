@@ -3,7 +3,6 @@
 The interpreter runs kernels on the CPU with the numbers' own precision: matrix products of float32 are exact there.
 """
 
-import inspect
 import os
 
 import pytest
@@ -17,27 +16,7 @@ from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels
 pytest.importorskip("triton", reason="Triton is there for Linux only")
 if os.environ.get("TRITON_INTERPRET") != "1":
     pytest.skip("Triton's interpreter is for machines without a GPU: CUDA_VISIBLE_DEVICES=", allow_module_level=True)
-from triton.runtime import interpreter
-
 from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO
-
-
-@pytest.fixture(scope="module", autouse=True)
-def patched_by_name():
-    """Tell the interpreter what is builtin: it looks through all of Triton's language with every call of a function."""
-    language = interpreter.tl
-    parts = (language, language.core, language.tensor, language.math, language.core.tensor_descriptor_base)
-    is_builtin = language.core.is_builtin
-    names = {part: [name for name, value in inspect.getmembers(part) if is_builtin(value)] for part in parts}
-
-    def patch(part, builder, scope):
-        for name in names[part]:
-            if is_builtin(member := getattr(part, name)):
-                interpreter._patch_attr(part, name, member, builder, scope)
-
-    with pytest.MonkeyPatch.context() as context:
-        context.setattr(interpreter, "_patch_builtin", patch)
-        yield
 
 
 def make(kind=TritonPPO, **settings):
