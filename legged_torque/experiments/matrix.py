@@ -12,7 +12,6 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
-from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options, draw_only
@@ -80,7 +79,7 @@ class Matrix:
     tasks: list[str]
     environments: dict[str, list[str]]  # for each perturbation during training, those of the evaluations
     seeds: list[int]
-    preset: str = ""  # of the trainings, as --preset takes it; empty: the default
+    preset: str = ""  # of the trainings, as --preset takes it; empty: that of the device
     ranges: str = ""  # of random parameters, as --ranges takes them; empty: the tasks' own
     train: dict[str, Any] = field(default_factory=dict)  # changed settings, by dotted path
     evaluation: dict[str, Any] = field(default_factory=dict)  # as EVALUATION
@@ -104,9 +103,10 @@ class Matrix:
         return {"tasks": self.tasks, "seeds": self.seeds, "environments": list(self.environments), **evaluated}
 
     def settings(self) -> dict[str, Any]:
-        """Return what is set for all cells, by dotted path."""
-        shared = ("preset", "ranges", "train", "evaluation", "grounds", "sweeps")
-        return flat({name: value for name, value in vars(self).items() if name in shared and value})
+        """Return what is set for all cells, by "section.key"; values stay whole."""
+        named = {name: value for name in ("preset", "ranges") if (value := getattr(self, name))}
+        sections = {name: getattr(self, name) for name in ("train", "evaluation", "grounds", "sweeps")}
+        return named | {f"{name}.{key}": value for name, values in sections.items() for key, value in values.items()}
 
     def set_words(self, sweep: str = "") -> list[str]:
         """Return the changed settings of the trainings as ``--set`` takes them, or those of a sweep."""
@@ -159,9 +159,8 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     rising_levels(matrix.grounds.get("levels", []))
     of_tasks = {}
     for cell in matrix.cells(Path()):
-        words = matrix.set_words()
-        options = Options(device="cpu", seed=cell.seed, preset=matrix.preset, ranges=matrix.ranges, set=words)
-        options.perturbation = cell.environment
+        words, options = matrix.set_words(), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
+        options.preset, options.ranges, options.set = matrix.preset, matrix.ranges, words
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
         for name in cell.evaluated_in:
@@ -214,9 +213,10 @@ def check_same(matrix: Matrix, out: Path) -> None:
         return
     old, differs = read_plan(out / SETTINGS_FILE), f"'{out}' was made with other settings"
     was, now = old.settings(), matrix.settings()
-    for key in sorted(key for key in was.keys() | now.keys() if was.get(key) != now.get(key)):
-        texts = f"{now.get(key, 'not set')}, was {was.get(key, 'not set')}"
-        raise UserError(f"{differs}: {key} is {texts}; give another --out")
+    for key in sorted(was.keys() | now.keys()):
+        is_now, before = (str(each.get(key, "not set")) for each in (now, was))
+        if is_now != before:
+            raise UserError(f"{differs}: {key} is {is_now}, was {before}; give another --out")
     for key, values in old.lists().items():
         lost = [str(value) for value in values if value not in matrix.lists().get(key, [])]
         if lost:

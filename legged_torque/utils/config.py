@@ -32,7 +32,7 @@ class Section:
     _mistakes: ClassVar[dict[str, str]] = {}
     """What is wrong with names of this class and of its sections, by dotted path."""
     _names: ClassVar[list[str]] = []
-    """Names of settings and sections, found once: hundreds of instances are made at each start."""
+    """Names of settings and sections when the class was made: found once, as each start makes hundreds of instances."""
 
     def __init_subclass__(cls) -> None:
         """Keep mistakes in the names of a new class, and let its nested classes inherit."""

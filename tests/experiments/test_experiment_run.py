@@ -133,6 +133,7 @@ def test_a_cell_that_another_process_works_on(stage, tmp_path):
         ({"train": {"runner.total_steps": 64}}, "train.runner.total_steps is 64, was 128; give another --out"),
         ({"train": {}}, "train.runner.total_steps is not set, was 128"),
         ({"ranges": "hard"}, "ranges is hard, was not set"),
+        ({"sweeps": {"ground_friction": {}}}, "sweeps.ground_friction is {}, was not set"),
         ({"environments": {"low": ["low"]}}, "environments.low had high as well"),
     ],
 )
