@@ -16,10 +16,11 @@ def laptop() -> dict[str, Any]:
     """Return settings with which a robot walks soon on a CPU: few worlds, small networks, a short training."""
     return {
         "linear_changes": 0.3,
+        "env": {"num_envs_cpu": 128},
         "actor": {"hidden_dims": [128, 128]},
         "critic": {"hidden_dims": [128, 128]},
-        "runner": {"num_steps_per_env": 48, "total_steps": 20_000_000},
-        "algorithm": {"num_mini_batches": 8},
+        "runner": {"total_steps": 20_000_000},
+        "algorithm": {"lam": 0.9},
         "evaluation": {"interval": 500_000, "num_samples": 16_000},
     }
 
