@@ -25,7 +25,7 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 222,
     "legged_torque/deploy": 1523,
-    "legged_torque/envs": 5251,
+    "legged_torque/envs": 5247,
     "legged_torque/experiments": 1090,
     "legged_torque/identification": 415,
     "legged_torque/importer": 1252,
@@ -40,10 +40,10 @@ LINES = {
     "scripts": 2035,
     "paper": 3042,
     "tools": 1230,
-    "tests": 23_790,
+    "tests": 23_859,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 31_636  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_632  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -14,15 +14,9 @@ def standard_presets() -> dict[str, dict[str, Any]]:
 
 def laptop() -> dict[str, Any]:
     """Return settings with which a robot walks soon on a CPU: few worlds, small networks, a short training."""
-    return {
-        "linear_changes": 0.3,
-        "env": {"num_envs_cpu": 128},
-        "actor": {"hidden_dims": [128, 128]},
-        "critic": {"hidden_dims": [128, 128]},
-        "runner": {"total_steps": 20_000_000},
-        "algorithm": {"lam": 0.9},
-        "evaluation": {"interval": 500_000, "num_samples": 16_000},
-    }
+    sizes = {"env": {"num_envs_cpu": 128}, "runner": {"total_steps": 20_000_000}, "algorithm": {"lam": 0.9}}
+    networks = {name: {"hidden_dims": [128, 128]} for name in ("actor", "critic")}
+    return {"linear_changes": 0.3, **sizes, **networks, "evaluation": {"interval": 500_000, "num_samples": 16_000}}
 
 
 def paper() -> dict[str, Any]:
