@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2035,
     "paper": 3042,
     "tools": 1230,
-    "tests": 23_860,
+    "tests": 23_853,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 31_632  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
