@@ -22,7 +22,7 @@ def plot_curves() -> None:
     """Draw a panel per metric and a line per training."""
     example = "python scripts/plot.py curves CURVES.csv.gz --out curves.png"
     parser = Parser(f"Draw learning curves (Figure 3): ``{example}``.")
-    help_text = "JSON of evaluate.py --all_checkpoints, evaluations.csv of a run, or evaluations.csv.gz of a report"
+    help_text = "evaluations.csv of a run, or evaluations.csv.gz of a report"
     parser.add_argument("files", type=Path, nargs="+", help=help_text)
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()

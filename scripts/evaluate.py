@@ -1,4 +1,4 @@
-"""Measure a checkpoint, or all of a run.
+"""Measure a checkpoint.
 
 Examples:
     python scripts/evaluate.py                                          # the last run, as in its training
@@ -6,7 +6,6 @@ Examples:
     python scripts/evaluate.py --load_run RUN --command 0.5 0 0.2       # with one command
     python scripts/evaluate.py --terrain all --level 0.5                # on rough ground
     python scripts/evaluate.py --sweep ground_friction                  # by the value of a random parameter
-    python scripts/evaluate.py --all_checkpoints                        # a learning curve, for plot.py curves
 
 With ``--terrain`` and ``--level``, robots try to cross tiles of rough ground, once in each world: see docs/terrain.md.
 """
@@ -21,14 +20,13 @@ from typing import TYPE_CHECKING, Any
 from legged_torque.envs import task_registry
 from legged_torque.experiments.matrix import GROUNDS
 from legged_torque.utils import cli
-from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError, counted
-from legged_torque.utils.files import path_inside, portable_path, without_machine, write_json
+from legged_torque.utils.files import portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import PUSH, draw_only
-from legged_torque.utils.runs import checkpoint_numbers, find_checkpoint, package_versions
+from legged_torque.utils.runs import package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
 
 if TYPE_CHECKING:
@@ -37,9 +35,7 @@ if TYPE_CHECKING:
     from legged_torque.envs.base.crossing import Grounds
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
-WORLDS, STEPS = 16, 2000  # of one checkpoint, where robots do not cross tiles
-CURVE_WORLDS, CURVE_STEPS = 256, 1000  # of each of all checkpoints
-CURVE_SEED = 1000  # added to the training's seed: worlds other than in training, but the same for every checkpoint
+WORLDS, STEPS = 16, 2000  # of one checkpoint
 
 
 def main() -> None:
@@ -53,12 +49,9 @@ def main() -> None:
 
             grounds = Grounds.of(args.terrain, args.level, args.command)
         run = task_registry.load_run(options)
-        if args.all_checkpoints and not args.json:
-            args.json = path_inside(run.folder, "curve.json")
         if args.json:
             cli.check_output(args.json)
-        if args.seed is None:
-            args.seed = run.train_cfg.seed + CURVE_SEED if args.all_checkpoints else 1
+        args.seed = 1 if args.seed is None else args.seed
         import torch
 
         from legged_torque.envs.base.evaluation import evaluation_cfg
@@ -73,9 +66,7 @@ def main() -> None:
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
-    if args.all_checkpoints:
-        measured = measure_all(args, run, env, runner)
-    elif args.sweep:
+    if args.sweep:
         measured = sweep(args, run, env, runner)
     elif grounds:
         measured = cross_tiles(run, env, runner, grounds)
@@ -95,9 +86,6 @@ def parse_args() -> argparse.Namespace:
     """Return the command line; a UserError if it makes no sense."""
     parser = cli.Parser(__doc__)
     cli.add_task_args(parser)
-    hint = f"""measure every checkpoint of the run; by default in {CURVE_WORLDS} worlds for {CURVE_STEPS} steps,
-        an episode, into curve.json in the run's folder"""
-    parser.add_argument("--all_checkpoints", action="store_true", help=hint)
     parser.add_argument("--steps", type=int, help=f"control steps; default: {STEPS}")
     cli.add_command_arg(parser)
     hint = """kinds of rough ground to cross, or all; then --num_envs is for each kind and level, and --command a speed
@@ -109,17 +97,14 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--sweep", metavar="NAME", help=hint)
     parser.add_argument("--json", type=Path, help="file to write")
     args = parser.parse_args()
-    if args.all_checkpoints and (args.terrain or args.checkpoint is not None):
-        raise UserError("--all_checkpoints takes neither --terrain nor --checkpoint")
-    if args.sweep and (args.terrain or args.all_checkpoints):
-        raise UserError("--sweep takes neither --terrain nor --all_checkpoints")
+    if args.sweep and args.terrain:
+        raise UserError("--sweep does not take --terrain")
     if args.terrain and args.steps is not None:
         raise UserError("--steps is not for --terrain: how long robots may try follows from the command")
     if args.level and not args.terrain:
         raise UserError("--level needs --terrain: the kinds of rough ground")
-    num_envs, steps = (CURVE_WORLDS, CURVE_STEPS) if args.all_checkpoints else (WORLDS, STEPS)
-    args.num_envs = num_envs if args.num_envs is None else args.num_envs
-    args.steps = steps if args.steps is None else args.steps
+    args.num_envs = WORLDS if args.num_envs is None else args.num_envs
+    args.steps = STEPS if args.steps is None else args.steps
     args.level = args.level or GROUNDS["levels"]
     cli.check_args(args, steps=Count, command=list[float])
     return args
@@ -147,24 +132,6 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
             print((line + "{error:7.3f} +- {error_standard_error:.3f}").format(what, **part))
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
-
-
-def measure_all(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:
-    """Measure all checkpoints in the order of training, print a line for each, and return their metrics."""
-    from legged_torque.envs.base.metrics import measure
-
-    points = []
-    for number in checkpoint_numbers(run.folder):
-        infos = runner.load(str(find_checkpoint(run.folder, number)), {"actor": True, "iteration": True})
-        set_seed(args.seed)
-        means = measure(env, runner.get_inference_policy(env.device), args.steps).means()
-        points.append({"steps": infos["total_timesteps"], "seconds": infos["seconds"], **means})
-        texts = [f"{name} {mean:.4f}" for name, mean in means.items()]
-        print(f"{infos['total_timesteps']:>12,} steps", *texts, sep="  ", flush=True)
-    settings = {"num_envs": env.num_envs, "num_steps": args.steps, "actions": "mean", "env": to_dict(env.cfg)}
-    settings["seed"] = args.seed
-    result = {"seed": run.config["train"]["seed"], "trained_with": run.config["train"], "evaluation": settings}
-    return result | {"trained_env": run.config["env"], "points": points}
 
 
 def sweep(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner) -> dict[str, Any]:

@@ -24,9 +24,9 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 222,
-    "legged_torque/deploy": 1523,
-    "legged_torque/envs": 5247,
-    "legged_torque/experiments": 1090,
+    "legged_torque/deploy": 1525,
+    "legged_torque/envs": 5252,
+    "legged_torque/experiments": 1103,
     "legged_torque/identification": 415,
     "legged_torque/importer": 1252,
     "legged_torque/learning": 3918,
@@ -35,15 +35,15 @@ LINES = {
     "legged_torque/sensors": 302,
     "legged_torque/sim": 5741,
     "legged_torque/terrain": 591,
-    "legged_torque/utils": 3212,
+    "legged_torque/utils": 3219,
     "legged_torque/viewer": 2487,
-    "scripts": 2035,
-    "paper": 3042,
+    "scripts": 2002,
+    "paper": 3037,
     "tools": 1230,
-    "tests": 23_853,
+    "tests": 23_846,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 31_632  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_626  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -75,7 +75,7 @@ class Simulation:
         losses = description.get("copper_loss", {})
         self._copper_loss = np.array([losses.get(name, 0.0) for name in policy.joint_order])
         self.has_losses = bool(self._copper_loss.any())
-        self.command, self._power = np.zeros(3), np.zeros(2)
+        self.command, self._power = np.zeros(3), np.zeros(3)
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
@@ -92,7 +92,7 @@ class Simulation:
         self._origin = self.robot.origins[self._rng.integers(len(self.robot.origins))]
         self._new_episode()
         self._follow_heading()
-        sums = np.zeros(NUM_SUMS)
+        sums, self._last_torques = np.zeros(NUM_SUMS), np.zeros(len(self.policy.joint_order))
         with np.errstate(over="ignore", invalid="ignore"):  # reported below, in one line
             for _ in range(num_steps):
                 command = self.command.copy()
@@ -104,7 +104,7 @@ class Simulation:
         return sums
 
     def _control_step(self) -> None:
-        """Observe, act, and apply torques in all physics steps of a control step; keep their mean power [W]."""
+        """Observe, act, and apply torques in all physics steps of a control step; keep their power and change."""
         policy, robot = self.policy, self.robot
         is_late = self._measurements.is_needed
         state = dataclasses.replace(self._measurements.received(self._now)) if is_late else self._measured()
@@ -121,11 +121,13 @@ class Simulation:
                 wanted = policy.wanted_torques(actions, *self._motors.measured(pos, vel))
             robot.step(self._motors.apply(wanted, pos, vel))
             applied = self._motors.before_friction(robot.applied_torques())
-            self._power += np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
+            power = np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
+            self._power += *power, np.abs(applied - self._last_torques).mean()
+            self._last_torques = applied
             self._now += 1
             if is_late:
                 self._measurements.send(self._now, self._measured())
-        self._power /= self._timing["decimation"]
+        self._power[:2] /= self._timing["decimation"]
         self._steps += 1
 
     def _finish_step(self, command: np.ndarray) -> np.ndarray:

@@ -31,9 +31,10 @@ EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, by default."""
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
 """Tiles that are crossed after training, and robots on each of them, by default."""
+NAME = r"\w[\w.-]*"  # of what names files, folders and figures
 TYPES = {"num_envs": Count, "num_steps": Count, "kinds": list[str], "levels": list[float]}
-ROUGH_GROUND, SWEEP = "rough ground", "sweep of "
-"""Name of the evaluation on :data:`GROUNDS`, and how those of sweeps begin. Names of environments have no spaces."""
+ROUGH_GROUND, SWEEP, CONDITION = "rough ground", "sweep of ", "condition "
+"""Name of the evaluation on :data:`GROUNDS`, and how others begin. Names of environments have no spaces."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Cell:
     environment: str  # perturbation during training
     seed: int
     evaluated_in: tuple[str, ...]  # perturbations
-    further: tuple[str, ...] = ()  # other evaluations of the last checkpoint: ROUGH_GROUND, sweeps
+    further: tuple[str, ...] = ()  # of the last checkpoint: ROUGH_GROUND, sweeps, conditions
 
     @property
     def name(self) -> str:
@@ -59,8 +60,9 @@ class Cell:
 
     def result_file(self, evaluation: str) -> Path:
         """Return the file with the numbers of an evaluation of the last checkpoint."""
-        if evaluation.startswith(SWEEP):
-            return self.folder / f"sweep_{evaluation.removeprefix(SWEEP)}.json"
+        for start, kind in ((SWEEP, "sweep"), (CONDITION, "condition")):
+            if evaluation.startswith(start):
+                return self.folder / f"{kind}_{evaluation.removeprefix(start)}.json"
         return self.folder / ("grounds.json" if evaluation == ROUGH_GROUND else f"result_{evaluation}.json")
 
     def part_file(self, evaluation: str) -> Path:
@@ -85,17 +87,23 @@ class Matrix:
     evaluation: dict[str, Any] = field(default_factory=dict)  # as EVALUATION
     grounds: dict[str, Any] = field(default_factory=dict)  # as GROUNDS; empty: none
     sweeps: dict[str, Any] = field(default_factory=dict)  # settings of each, by the parameter that is swept
+    conditions: dict[str, Any] = field(default_factory=dict)  # settings of other evaluations, by names of one's own
     task_files: tuple[str, ...] = ()  # --task_file of the command line; a description cannot name any
 
     def cells(self, out: Path) -> list[Cell]:
         """Return all cells in a folder, seed by seed, so that tasks can be compared before all seeds are done."""
-        further = (*([ROUGH_GROUND] if self.grounds else []), *(f"{SWEEP}{name}" for name in self.sweeps))
+        further = (*([ROUGH_GROUND] if self.grounds else []), *self.changed())
         return [
             Cell(out / f"{task}-{environment}-s{seed}", task, environment, seed, tuple(evaluated_in), further)
             for seed in self.seeds
             for environment, evaluated_in in self.environments.items()
             for task in self.tasks
         ]
+
+    def changed(self) -> dict[str, dict[str, Any]]:
+        """Return the changed settings of sweeps and conditions, by the names of their evaluations."""
+        of_sweeps = {f"{SWEEP}{name}": settings for name, settings in self.sweeps.items()}
+        return of_sweeps | {f"{CONDITION}{name}": settings for name, settings in self.conditions.items()}
 
     def lists(self) -> dict[str, list[Any]]:
         """Return the lists that make up the cells, by their keys."""
@@ -105,13 +113,8 @@ class Matrix:
     def settings(self) -> dict[str, Any]:
         """Return what is set for all cells, by "section.key"; values stay whole."""
         named = {name: value for name in ("preset", "ranges") if (value := getattr(self, name))}
-        sections = {name: getattr(self, name) for name in ("train", "evaluation", "grounds", "sweeps")}
+        sections = {name: getattr(self, name) for name in ("train", "evaluation", "grounds", "sweeps", "conditions")}
         return named | {f"{name}.{key}": value for name, values in sections.items() for key, value in values.items()}
-
-    def set_words(self, sweep: str = "") -> list[str]:
-        """Return the changed settings of the trainings as ``--set`` takes them, or those of a sweep."""
-        changed = self.sweeps[sweep] if sweep else self.train
-        return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in changed.items()]
 
 
 KEYS = {name: hint for name, hint in types_of(Matrix).items() if name != "task_files"}
@@ -159,16 +162,18 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     rising_levels(matrix.grounds.get("levels", []))
     of_tasks = {}
     for cell in matrix.cells(Path()):
-        words, options = matrix.set_words(), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
+        words, options = set_words(matrix.train), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
         options.preset, options.ranges, options.set = matrix.preset, matrix.ranges, words
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
         for name in cell.evaluated_in:
             if name not in env_cfg.perturbations():
                 raise unknown_name("perturbation", name, env_cfg.perturbations())
-        for name in matrix.sweeps if cell.task not in of_tasks else ():
-            options.set = [*words, *matrix.set_words(name)]
-            draw_only(task_registry.get_cfgs(cell.task, options)[0], name)
+        for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
+            options.set = [*words, *set_words(settings)]
+            check_env_cfg(changed := task_registry.get_cfgs(cell.task, options)[0])
+            if evaluation.startswith(SWEEP):
+                draw_only(changed, evaluation.removeprefix(SWEEP))
         of_tasks[cell.task] = env_cfg
     for env_cfg in of_tasks.values():
         load_asset(env_cfg)
@@ -194,15 +199,18 @@ def read_plan(file: Path) -> Matrix:
             if value == []:
                 raise UserError(f"{section}.{key} must hold one entry or more, not {value}")
     grounds = GROUNDS | values["grounds"] if values.get("grounds") else {}
-    for name, settings in values.get("sweeps", {}).items():
-        if not isinstance(settings, dict):
-            raise UserError(f"sweeps.{name} must hold settings, not {settings!r}")
+    for section in ("sweeps", "conditions"):
+        for name, settings in values.get(section, {}).items():
+            if not isinstance(settings, dict):
+                raise UserError(f"{section}.{name} must hold settings, not {settings!r}")
+            if not re.fullmatch(NAME, str(name)):
+                raise UserError(f"{section} must hold names, not {name!r}")
     matrix = Matrix(**values | {"evaluation": EVALUATION | values.get("evaluation", {}), "grounds": grounds})
     for key, entries in matrix.lists().items():
         if not entries or len(set(entries)) < len(entries):
             raise UserError(f"{key} must hold different entries, one or more, not {entries}")
-        for entry in entries:  # they name folders and figures
-            if key != "seeds" and not re.fullmatch(r"\w[\w.-]*", str(entry)):
+        for entry in entries:
+            if key != "seeds" and not re.fullmatch(NAME, str(entry)):
                 raise UserError(f"{key} must hold names, not {entry!r}")
     return matrix
 
@@ -233,19 +241,24 @@ def step_words(matrix: Matrix, cell: Cell, state: CellState, device: str) -> lis
             kinds, levels, num_envs = (matrix.grounds[key] for key in GROUNDS)
             words += [f"--num_envs={num_envs}", "--terrain", *kinds, "--level", *map(str, levels)]
         else:
-            swept = name.removeprefix(SWEEP) if name.startswith(SWEEP) else ""
-            words += [f"--perturbation={'none' if swept else name}"]
+            words += [f"--perturbation={name if name in cell.evaluated_in else 'none'}"]
             words += [f"--num_envs={numbers['num_envs']}", f"--steps={numbers['num_steps']}"]
-            words += [f"--sweep={swept}", *(f"--set={word}" for word in matrix.set_words(swept))] if swept else []
+            words += [f"--sweep={name.removeprefix(SWEEP)}"] if name.startswith(SWEEP) else []
+            words += [f"--set={word}" for word in set_words(matrix.changed().get(name, {}))]
         return ["evaluate.py", *words, f"--json={cell.part_file(name)}"]
     if state.step == "resume":
         return ["train.py", *words, "--resume"]
     words += [f"--seed={cell.seed}", f"--perturbation={cell.environment}"]
     also = [name for name in cell.evaluated_in if name != cell.environment]
-    words += [f"--set={word}" for word in [*matrix.set_words(), f"evaluation.also={json.dumps(also)}"]]
+    words += [f"--set={word}" for word in [*set_words(matrix.train), f"evaluation.also={json.dumps(also)}"]]
     words.append("--set=evaluation.at_end=False")  # those are short: without others, the last checkpoint is measured
     named = {"preset": matrix.preset, "ranges": matrix.ranges}
     return ["train.py", *words, *(f"--{name}={value}" for name, value in named.items() if value)]
+
+
+def set_words(changed: dict[str, Any]) -> list[str]:
+    """Return changed settings as ``--set`` takes them."""
+    return [f"{key}={v if isinstance(v, str) else json.dumps(v, default=str)}" for key, v in changed.items()]
 
 
 def command_of(words: list[str]) -> list[str]:

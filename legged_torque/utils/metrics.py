@@ -14,6 +14,8 @@ world was reset are left out, but for the count of falls.
 - electrical_power, electrical_cost: the same with copper losses, mean of sum |tau_i qd_i| + c_i tau_i^2 [W], if
   ``control.copper_loss`` gives c = R / (gear Kt)^2 [W/(N m)^2]: the current is tau / (gear Kt), and its heat I^2 R.
   No source gives R and Kt of Unitree's motors, so that a number for them is an assumption.
+- torque_rate: mean over joints and time of |change of torque| between physics steps, per second [N m/s]. The first step
+  of an episode counts the change from the episode before.
 - height: mean height of the trunk's origin above the ground [m]. speed: mean horizontal speed [m/s].
 - falls_per_minute: resets that are not time-outs, per minute of one robot.
 """
@@ -37,12 +39,13 @@ UNITS = {
     "mechanical_power": "W",
     "electrical_power": "W",
     "electrical_cost": "",
+    "torque_rate": "N m/s",
     "height": "m",
     "speed": "m/s",
     "falls_per_minute": "1/min",
 }
 """Units of the metrics, by their names in files and on the terminal; each has its formula in :func:`ratios`."""
-NUM_SUMS = 11  # numbers that step_sums returns for each world
+NUM_SUMS = 12  # numbers that step_sums returns for each world
 
 
 @dataclass
@@ -73,6 +76,7 @@ def step_sums(
     force: Array,
     power: Array,
     copper: Array,
+    torque_change: Array,
     height: Array,
     fell: Array,
     ended: Array,
@@ -89,6 +93,7 @@ def step_sums(
         force: Sum over geoms of the norm of the ground's force [N]. Shape: (worlds,).
         power: Sum over joints of |torque times velocity|, mean over physics steps [W]. Shape: (worlds,).
         copper: Heat in the windings, likewise [W]. Shape: (worlds,).
+        torque_change: Sum over physics steps of the mean over joints of |change of torque| [N m]. Shape: (worlds,).
         height: Of the trunk's origin above the ground [m]. Shape: (worlds,).
         fell: Whether the episode ended with the step, but not by its time. Shape: (worlds,), bool.
         ended: Whether it ended at all; then nothing but the fall counts. Shape: (worlds,), bool.
@@ -96,13 +101,14 @@ def step_sums(
 
     Returns:
         Shape: (:data:`NUM_SUMS`, worlds): steps, tracking percentage, steps with a command, xy, angular, force, power,
-        copper, height, speed, falls.
+        copper, change of torque, height, speed, falls.
     """
     error = abs(commands - velocity)
     percentage, is_commanded = tracking_percentage(xp, error[:, :tracked], commands[:, :tracked])
     one, zero = xp.ones_like(percentage), xp.zeros_like(percentage)
     xy, angular = (error[:, :2] ** 2).sum(axis=1), error[:, 2] ** 2
-    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, power, copper, height, speed, zero])
+    moved = [power, copper, torque_change, height, speed]
+    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, *moved, zero])
     rows = xp.where(ended, 0.0, rows)
     rows[-1] = fell
     return rows
@@ -114,7 +120,7 @@ def ratios(sums: Array, weight: float, control_step: float, has_losses: bool) ->
     ``sums`` are those of :func:`step_sums`, ``weight`` is the robot's m g [N], and ``control_step`` is in seconds. A
     robot that ``has_losses`` has metrics of electrical power, too.
     """
-    steps, percentage, commanded, xy, angular, force, power, copper, height, speed, falls = sums
+    steps, percentage, commanded, xy, angular, force, power, copper, change, height, speed, falls = sums
     electrical = {"electrical_power": (power + copper, steps), "electrical_cost": (power + copper, weight * speed)}
     return {
         "track_percentage": (percentage, commanded),
@@ -124,6 +130,7 @@ def ratios(sums: Array, weight: float, control_step: float, has_losses: bool) ->
         "cost_of_transport": (power, weight * speed),
         "mechanical_power": (power, steps),
         **(electrical if has_losses else {}),
+        "torque_rate": (change, steps * control_step),
         "height": (height, steps),
         "speed": (speed, steps),
         "falls_per_minute": (falls, steps * (control_step / 60.0)),

@@ -10,7 +10,6 @@ import pandas as pd
 
 from legged_torque.paper.metrics import METRICS, Metric
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import read_data
 from legged_torque.utils.runs import load_config
 
 MILLION = 1e6  # steps in a million, the unit of texts and figures
@@ -25,7 +24,7 @@ COLUMNS = ["steps", "seconds", *METRIC_NAMES, LEVEL.name]
 
 
 def read_curves(file: Path) -> pd.DataFrame:
-    """Read learning curves: JSON of ``evaluate.py``, a run's ``evaluations.csv``, or a report's (.gz).
+    """Read learning curves: a run's ``evaluations.csv``, or a report's (.gz).
 
     Returns:
         :data:`COLUMNS` and the columns task, environment and seed; the environment is "" if the file does not name it.
@@ -35,14 +34,10 @@ def read_curves(file: Path) -> pd.DataFrame:
     """
     problems: list[str] = []
     try:
-        if file.suffix == ".json":
-            training = read_data(file, {"task", "seed", "points"}, "evaluate.py")
-            texts = pd.DataFrame(training["points"], dtype=object)
-        else:
-            texts, training = read_csv(file, problems), {}
-            if "task" not in texts:
-                config = load_config(file.parent)
-                training = {"task": config["task"], "seed": config["train"]["seed"]}
+        texts, training = read_csv(file, problems), {}
+        if "task" not in texts:
+            config = load_config(file.parent)
+            training = {"task": config["task"], "seed": config["train"]["seed"]}
         table, unnamed = to_numbers(texts, file, problems), pd.Series("", texts.index)
         for name, kind in {"task": str, "environment": str, "seed": int}.items():
             table[name] = kind(training[name]) if name in training else texts.get(name, unnamed).map(kind)

@@ -82,6 +82,8 @@ def sums_by_hand(steps, dt):
             x, y, yaw = now["commands"]
             speed = math.hypot(vx, vy)
             power = sum(abs(tau * v) for tau, v in zip(now["torques"], now["joint_vel"], strict=True))
+            before = steps["torques"][t - 1, w] if t else np.zeros(12)  # also after a reset
+            change = np.abs(now["torques"] - before).mean()
             heat = sum(c * tau**2 for tau, c in zip(now["torques"], COPPER_OF_JOINTS, strict=True))
             result["track_xy"][:, w] += (vx - x) ** 2 + (vy - y) ** 2, 1.0
             result["track_angular"][:, w] += (yaw_rate - yaw) ** 2, 1.0
@@ -90,6 +92,7 @@ def sums_by_hand(steps, dt):
             result["mechanical_power"][:, w] += power, 1.0
             result["electrical_cost"][:, w] += power + heat, WEIGHT * speed
             result["electrical_power"][:, w] += power + heat, 1.0
+            result["torque_rate"][:, w] += change, dt
             result["height"][:, w] += now["height"], 1.0
             result["speed"][:, w] += speed, 1.0
             result["falls_per_minute"][1, w] += dt / 60.0
@@ -111,6 +114,7 @@ def test_every_metric_of_a_written_trajectory(task):
     steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1])
     assert steps["time_out"].any() and (steps["reset"] & ~steps["time_out"]).any()
     for seed in (1, 0):
+        add(task, metrics, commands=np.zeros((5, 3)))  # from no torque
         metrics.clear()
         steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1], seed)
         for t in range(40):
@@ -264,7 +268,7 @@ def test_arrays_and_tensors_give_the_same():
     generator = torch.Generator().manual_seed(5)
     commands, velocity = (torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     commands[:10, 1], commands[10:20] = 0.0, 0.0
-    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(5)]
+    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(6)]
     ended = torch.arange(50) % 7 == 0
     fell = ended & (torch.arange(50) % 2 == 0)
     batch = step_sums(torch, commands, velocity, *parts, fell, ended).numpy()

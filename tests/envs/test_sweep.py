@@ -119,7 +119,7 @@ def test_script(tmp_path):
     few = ["--num_envs=4", "--steps=3", "--device=cpu"]
     for words, message in (
         (["--sweep=trunk_mas"], "trunk_mass"),
-        (["--sweep=trunk_mass", "--all_checkpoints"], "--sweep takes neither"),
+        (["--sweep=trunk_mass", "--terrain=all"], "--sweep does not take --terrain"),
         ([f"--sweep={PUSH}", f"--set=domain_rand.{PUSH}=[0,0]"], f"{PUSH} is always 0"),
     ):
         assert_told_in_one_line(run_here("evaluate.py", *few, *words, root=tmp_path), message)

@@ -197,9 +197,10 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
 
 
 def test_tiles_are_crossed_after_training(stage, tmp_path):
-    """That and a sweep are steps of their own, done again alone; other tiles in the same folder are refused."""
+    """That, a sweep and a condition are steps of their own, done again alone; other tiles in the same folder are refused."""
     values = SMALL | {"tasks": ["a1_torque"], "grounds": {"kinds": ["flat", "pits"], "levels": [0, 0.5]}}
     values["sweeps"] = {"ground_friction": {"domain_rand.ground_friction": {"set": [0.4, 1.2]}}}
+    values["conditions"] = {"late": {"motors.delay.range": [2, 2]}}
     file, out = write(tmp_path / "m.yaml", values), tmp_path / "out"
     words = [file, f"--out={out}", "--device=cpu"]
     (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
@@ -212,6 +213,8 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     assert (swept["sweep"], swept["perturbation"]) == ("ground_friction", "none") and swept["set"].startswith(
         "domain_rand.ground_friction="
     )
+    late = json.loads((cell / "condition_late.json").read_text())
+    assert (late["perturbation"], late["set"]) == ("none", "motors.delay.range=[2, 2]") and "sweep" not in late
     result.unlink()
     listed = experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1]
     assert listed == "a1_torque-low-s1: evaluate in rough ground\n"

@@ -1,6 +1,5 @@
 """The scripts as a user runs them: mistakes in one line; training, stopping, resuming and playing fit together."""
 
-import json
 import math
 import os
 import re
@@ -65,18 +64,6 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
     assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (9, "none", 4)
-
-
-def test_learning_curve(root, tmp_path):
-    """Every checkpoint is measured, at the number of steps after which it was saved."""
-    file = tmp_path / "new" / "curve.json"
-    words = ["--task=a1_position", "--device=cpu", "--num_envs=2", "--steps=3", f"--json={file}", "--all_checkpoints"]
-    status, output, error = run_here("evaluate.py", *words, root=root)
-    assert (status, error) == (0, "") and len(output.splitlines()) == 3
-    curve = json.loads(file.read_text())
-    assert [point["steps"] for point in curve["points"]] == [0, 8, 16]
-    assert (curve["task"], curve["seed"], curve["evaluation"]["seed"]) == ("a1_position", 1, 1001)
-    assert all(math.isfinite(value) for point in curve["points"] for value in point.values())
 
 
 def test_nobody_reads_on(tmp_path):

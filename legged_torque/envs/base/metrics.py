@@ -68,6 +68,7 @@ class WalkingMetrics:
             force=state.contact_force.norm(dim=2).sum(dim=1),
             power=power.mechanical,
             copper=power.copper,
+            torque_change=power.torque_change,
             height=state.base_height,
             fell=state.reset_buf & ~state.time_out_buf,
             ended=state.reset_buf,
