@@ -2,19 +2,26 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { mergeGeometries } from "three/addons/utils/BufferGeometryUtils.js";
+import { mergeGeometries, mergeVertices, toCreasedNormals } from "three/addons/utils/BufferGeometryUtils.js";
 
 const [SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH] = [2, 3, 4, 5, 6, 7]; // mjtGeom
+const HAZE = new THREE.Color(0xdfe6ee); // the sky, and the floor far away
+const SHARP = 0.7; // faces that meet at a larger angle [rad] have an edge
 const DRAWN_GROUPS = 3; // MuJoCo hides the others
-const [SLOW, COARSEST] = [1 / 40, 0.3]; // frames that take longer [s] get fewer pixels, down to this ratio
+const LATE = 1 / 55; // frames that take longer [s] on average get fewer pixels
+const [STEP, PATIENCE] = [0.8, 4]; // of pixels per unit of length; calls of adapt() without a late one before more pixels
 const TURNED = new THREE.Matrix4().makeRotationX(Math.PI / 2); // three's cylinders are along y, MuJoCo's along z
 
 export class Scene {
   /** Takes an element to draw into and a model of MuJoCo, whose z axis points up. */
   constructor(canvas, model) {
     THREE.Object3D.DEFAULT_UP.set(0, 0, 1);
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !isSoftware() });
-    this.ratio = Math.min(window.devicePixelRatio, 2);
+    const hasGpu = !isSoftware();
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: hasGpu });
+    this.ratio = this.finest = Math.min(window.devicePixelRatio, 2);
+    this.coarsest = Math.min(this.finest, hasGpu ? 1 : 0.3);
+    [this.patience, this.onTime] = [PATIENCE, 0];
+    if (!hasGpu) canvas.style.imageRendering = "pixelated"; // to smooth a large picture takes half of a frame's time
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.05, 60);
     const size = model.stat.extent; // of the robot [m]
     this.height = model.stat.center[2];
@@ -23,15 +30,14 @@ export class Scene {
     this.controls.enablePan = false;
     this.controls.maxPolarAngle = 1.5;
     this.scene = new THREE.Scene();
-    this.scene.background = new THREE.Color(0xdfe6ee);
-    this.scene.fog = new THREE.Fog(0xdfe6ee, 6, 25);
+    this.scene.background = HAZE;
     this.sun = new THREE.DirectionalLight(0xffffff, 2.2);
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0x8a8f99, 1.6), this.sun, this.sun.target);
-    this.floor = floor();
-    this.bodies = Array.from({ length: model.nbody }, (_, body) => bodyMesh(model, body));
+    this.floor = floor(0.7 * size);
+    const material = hasGpu ? new THREE.MeshPhongMaterial({ vertexColors: true, shininess: 40 }) : mattMaterial();
+    const detail = (hasGpu ? 1e-4 : 1e-2) * size; // without a GPU, a frame's time grows with the number of triangles
+    this.bodies = Array.from({ length: model.nbody }, (_, body) => bodyMesh(model, body, material, detail));
     this.scene.add(this.floor, ...this.bodies.filter(Boolean));
-    this.shadow = blob(1.4 * size);
-    this.scene.add(this.shadow);
   }
 
   /** Moves the bodies to where they are in MuJoCo's data; the camera goes along with the trunk. */
@@ -42,19 +48,26 @@ export class Scene {
       mesh?.quaternion.set(xquat[4 * i + 1], xquat[4 * i + 2], xquat[4 * i + 3], xquat[4 * i]);
     });
     const at = new THREE.Vector3().fromArray(xpos, 3 * trunk);
-    this.shadow.position.set(at.x, at.y, 0.002);
     const moved = at.clone().sub(this.controls.target);
     moved.z = this.height - this.controls.target.z;
     this.controls.target.add(moved);
     this.camera.position.add(moved);
     this.sun.position.copy(at).add(new THREE.Vector3(2, -3, 6));
     this.sun.target.position.copy(at);
-    this.floor.position.set(2 * Math.round(at.x / 2), 2 * Math.round(at.y / 2), 0); // its pattern repeats every 2 m
+    this.floor.position.set(at.x, at.y, 0);
   }
 
-  /** Draws with fewer pixels from now on if frames take long [s]. */
+  /** Draws with fewer pixels from now on if frames take long [s], and tries more after some time without; it tries less
+   * often the more it was in vain. */
   adapt(frameTime) {
-    if (frameTime > SLOW) this.ratio = Math.max(0.8 * this.ratio, COARSEST);
+    this.onTime = frameTime > LATE ? 0 : this.onTime + 1;
+    if (!this.onTime && this.ratio > this.coarsest) {
+      this.ratio = Math.max(STEP * this.ratio, this.coarsest);
+      this.patience *= 2;
+    } else if (this.onTime > this.patience) {
+      this.ratio = Math.min(this.ratio / STEP, this.finest);
+      this.onTime = 0;
+    }
   }
 
   /** Draws a frame. */
@@ -79,20 +92,19 @@ function isSoftware() {
   return !info || /swiftshader|llvmpipe|software/i.test(gl.getParameter(info.UNMASKED_RENDERER_WEBGL));
 }
 
-/** Returns the mesh of a body's visible geoms, or null if it has none. */
-function bodyMesh(model, body) {
+/** Returns the mesh of a body's visible geoms with details down to some size [m], or null if it has none. */
+function bodyMesh(model, body, material, detail) {
   const parts = [];
   for (let geom = 0; geom < model.ngeom; geom++) {
     if (model.geom_bodyid[geom] !== body || model.geom_group[geom] >= DRAWN_GROUPS) continue;
     const shape = geometry(model, geom);
-    if (shape) parts.push(shape);
+    if (shape) parts.push(placed(shaded(shape, detail), model, geom));
   }
   if (!parts.length) return null;
-  const material = new THREE.MeshPhongMaterial({ vertexColors: true, shininess: 40 });
-  return new THREE.Mesh(mergeGeometries(parts), material);
+  return new THREE.Mesh(mergeVertices(mergeGeometries(parts)), material);
 }
 
-/** Returns a geom's surface in the frame of its body, in its colour; null for a plane and for kinds without one here. */
+/** Returns a geom's surface; null for a plane and for kinds without one here. */
 function geometry(model, geom) {
   const [a, b, c] = model.geom_size.slice(3 * geom, 3 * geom + 3);
   const make = {
@@ -103,10 +115,35 @@ function geometry(model, geom) {
     [BOX]: () => new THREE.BoxGeometry(2 * a, 2 * b, 2 * c),
     [MESH]: () => meshGeometry(model, model.geom_dataid[geom]),
   }[model.geom_type[geom]];
-  if (!make) return null;
-  const made = make();
-  const shape = made.index ? made.toNonIndexed() : made;
-  shape.deleteAttribute("uv");
+  return make ? make() : null;
+}
+
+/** Returns a mesh of the model. */
+function meshGeometry(model, mesh) {
+  const [vertex, face] = [model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]];
+  const vertices = model.mesh_vert.slice(3 * vertex, 3 * (vertex + model.mesh_vertnum[mesh]));
+  const corners = model.mesh_face.slice(3 * face, 3 * (face + model.mesh_facenum[mesh]));
+  const shape = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(vertices, 3));
+  return shape.setIndex(Array.from(corners));
+}
+
+/** Returns a shape with normals, whose corners closer than some distance [m] are one; thin shapes keep finer ones. */
+function shaded(shape, detail) {
+  ["normal", "uv"].forEach((name) => shape.deleteAttribute(name));
+  shape.computeBoundingBox();
+  const thickness = Math.min(...shape.boundingBox.getSize(new THREE.Vector3()));
+  const merged = mergeVertices(shape, Math.min(detail, thickness / 3));
+  const { array } = merged.index;
+  const corners = [];
+  for (let i = 0; i < array.length; i += 3) {
+    const [a, b, c] = array.slice(i, i + 3);
+    if (a !== b && b !== c && c !== a) corners.push(a, b, c);
+  }
+  return toCreasedNormals(merged.setIndex(corners), SHARP);
+}
+
+/** Returns a geom's shape in the frame of its body, in the geom's colour. */
+function placed(shape, model, geom) {
   const [w, x, y, z] = model.geom_quat.slice(4 * geom, 4 * geom + 4);
   const pose = new THREE.Matrix4().makeRotationFromQuaternion(new THREE.Quaternion(x, y, z, w));
   shape.applyMatrix4(pose.setPosition(...model.geom_pos.slice(3 * geom, 3 * geom + 3)));
@@ -119,46 +156,47 @@ function geometry(model, geom) {
   return shape.setAttribute("color", new THREE.BufferAttribute(colours, 3));
 }
 
-/** Returns the triangles of a mesh of the model, with its normals. */
-function meshGeometry(model, mesh) {
-  const [vertex, face] = [model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]];
-  const corners = model.mesh_face.slice(3 * face, 3 * (face + model.mesh_facenum[mesh]));
-  const vertices = new Float32Array(3 * corners.length);
-  corners.forEach((corner, i) => vertices.set(model.mesh_vert.slice(3 * (vertex + corner), 3 * (vertex + corner) + 3), 3 * i));
-  const shape = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(vertices, 3));
-  shape.computeVertexNormals();
-  return shape;
+/** Returns a material of one colour per vertex and matt, with light computed at vertices only: cheap without a GPU. */
+function mattMaterial() {
+  return new THREE.ShaderMaterial({
+    vertexColors: true,
+    vertexShader: `
+      varying vec3 shade;
+      void main() {
+        vec3 up = normalize(mat3(modelMatrix) * normal);
+        float light = 0.55 + 0.2 * up.z + 0.6 * max(dot(up, normalize(vec3(2.0, -3.0, 6.0))), 0.0);
+        shade = pow(min(color * light, 1.0), vec3(1.0 / 2.2));
+        gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+      }`,
+    fragmentShader: "varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }",
+  });
 }
 
-/** Returns a checkered floor. */
-function floor() {
-  const canvas = Object.assign(document.createElement("canvas"), { width: 2, height: 2 });
-  const context = canvas.getContext("2d");
-  context.fillStyle = "#aab2bd";
-  context.fillRect(0, 0, 2, 2);
-  context.fillStyle = "#98a1ad";
-  context.fillRect(0, 0, 1, 1);
-  context.fillRect(1, 1, 1, 1);
-  const texture = new THREE.CanvasTexture(canvas);
-  texture.magFilter = THREE.NearestFilter;
-  texture.wrapS = texture.wrapT = THREE.RepeatWrapping;
-  texture.repeat.set(30, 30);
-  texture.colorSpace = THREE.SRGBColorSpace;
-  return new THREE.Mesh(new THREE.PlaneGeometry(60, 60), new THREE.MeshBasicMaterial({ map: texture }));
-}
-
-/** Returns a soft dark spot of some width [m], in place of shadows, which slow machines draw slowly. */
-function blob(size) {
-  const canvas = Object.assign(document.createElement("canvas"), { width: 64, height: 64 });
-  const context = canvas.getContext("2d");
-  const gradient = context.createRadialGradient(32, 32, 4, 32, 32, 32);
-  gradient.addColorStop(0, "rgba(0,0,0,0.45)");
-  gradient.addColorStop(1, "rgba(0,0,0,0)");
-  context.fillStyle = gradient;
-  context.fillRect(0, 0, 64, 64);
-  const map = new THREE.CanvasTexture(canvas);
-  return new THREE.Mesh(
-    new THREE.PlaneGeometry(size, size),
-    new THREE.MeshBasicMaterial({ map, transparent: true, depthWrite: false }),
-  );
+/** Returns a floor of squares of 1 m that stay in place, with a dark spot of some radius [m] in its middle for a shadow.
+ * All is computed per pixel, for without a GPU textures and shadow maps cost most of a frame. */
+function floor(radius) {
+  const material = new THREE.ShaderMaterial({
+    uniforms: { spot: { value: 1 / radius ** 2 }, haze: { value: HAZE.clone().convertLinearToSRGB() } },
+    vertexShader: `
+      varying vec2 place, offset;
+      void main() {
+        vec4 world = modelMatrix * vec4(position, 1.0);
+        place = 0.5 * world.xy;
+        offset = position.xy;
+        gl_Position = projectionMatrix * viewMatrix * world;
+      }`,
+    fragmentShader: `
+      uniform float spot;
+      uniform vec3 haze;
+      varying vec2 place, offset;
+      void main() {
+        vec2 pixel = 0.5 * fwidth(place) + 1e-4; // half of one; squares are averaged over it, else far ones flicker
+        vec2 edges = (abs(fract(place - pixel) - 0.5) - abs(fract(place + pixel) - 0.5)) / pixel;
+        vec3 colour = mix(vec3(0.60, 0.63, 0.68), vec3(0.67, 0.70, 0.74), 0.5 - 0.125 * edges.x * edges.y);
+        float dark = 1.0 - min(spot * dot(offset, offset), 1.0);
+        colour *= 1.0 - 0.45 * dark * dark;
+        gl_FragColor = vec4(mix(colour, haze, clamp(0.05 / gl_FragCoord.w - 0.3, 0.0, 1.0)), 1.0);
+      }`,
+  });
+  return new THREE.Mesh(new THREE.PlaneGeometry(60, 60), material);
 }
