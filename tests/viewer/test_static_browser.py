@@ -26,8 +26,7 @@ DRIVE = {"drive": {"model": "drive", "damping": 0.5, "stiffness": 200.0}}
 STEPS = 25
 RUN = """
 const [steps, motors, holds, done] = arguments;
-const { simulation } = window;
-const { policy } = simulation;
+const { policy } = window.simulation;
 const [usual, refresh] = [policy.motors, policy.timing.refresh_torques];
 (async () => {
   policy.motors = motors;
@@ -40,6 +39,7 @@ const [usual, refresh] = [policy.motors, policy.timing.refresh_torques];
   done([Array.from(simulation.robot.data.qpos), simulation.torques]);
 })();
 """
+ADAPT = "for (let i = 1e5; i--; ) scene.adapt(arguments[0]); return [scene.coarsest, scene.finest].indexOf(scene.ratio)"
 
 
 @pytest.fixture(scope="module", params=POLICIES)
@@ -109,6 +109,6 @@ def test_page(browser, served):
     assert browser.execute_script("return simulation.command") == [0, 0, 0]
     for width in (1920, 1280, 390):
         with screen(browser, width, 800, 0.1):  # few pixels are drawn
-            wide = browser.execute_script("return document.documentElement.scrollWidth")
-            assert wide <= width
+            assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    assert [browser.execute_script(ADAPT, time) for time in (1 / 30, 1 / 60)] == [0, 1]
     assert not complaints(browser)

@@ -117,7 +117,7 @@ async function main() {
   const show = controls(page, simulation);
   const step = 1 / page.description.timing.control_frequency;
   let [last, behind, since, simulated, frames] = [performance.now(), 0, performance.now(), 0, 0];
-  window.simulation = simulation;
+  Object.assign(window, { simulation, scene });
   const frame = async (now) => {
     behind = Math.min(behind + (now - last) / 1000, MOST_BEHIND + step);
     last = now;
