@@ -57,8 +57,8 @@ export class Scene {
     this.floor.position.set(at.x, at.y, 0);
   }
 
-  /** Draws with fewer pixels from now on if frames take long [s], and tries more after some time without; it tries less
-   * often the more it was in vain. */
+  /** Draws with fewer pixels from now on if frames take long [s], and with more once they have been on time for a while,
+   * which is twice as long after each late one. */
   adapt(frameTime) {
     this.onTime = frameTime > LATE ? 0 : this.onTime + 1;
     if (!this.onTime && this.ratio > this.coarsest) {
@@ -156,7 +156,7 @@ function placed(shape, model, geom) {
   return shape.setAttribute("color", new THREE.BufferAttribute(colours, 3));
 }
 
-/** Returns a material of one colour per vertex and matt, with light computed at vertices only: cheap without a GPU. */
+/** Returns a matt material in the vertices' colours, whose light is computed at vertices only: cheap without a GPU. */
 function mattMaterial() {
   return new THREE.ShaderMaterial({
     vertexColors: true,
