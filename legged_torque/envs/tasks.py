@@ -37,6 +37,26 @@ class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
     """Its training."""
 
 
+class A1TorqueDampedCfg(A1TorqueCfg):
+    """A1 with torques that bears 20 ms of latency, which it has seen, with damping on the drives; docs/results.md."""
+
+    class env:
+        history_length = 3
+
+    class motors:
+        chain = ["delay", "drive", "ideal", "urdf"]
+
+        class delay:
+            range = [0, 4]
+
+        class drive:
+            damping = 0.5
+
+    class sensing:
+        class delay:
+            range = [0, 1]
+
+
 class A1TorqueGravityCfgPPO(torque_gravity.TorqueGravityCfgPPO, A1CfgPPO):
     """Training of torque control from a policy that stands."""
 
@@ -53,10 +73,8 @@ class A1TorqueCurriculumHighCfg(A1TorqueCurriculumCfg):
     """The same with a higher nominal pose: its feet are below the same places of the trunk, and 0.33 m below it.
 
     With links of 0.2 m, a thigh angle t and a calf angle c, a foot is 0.4 cos(c / 2) away from its thigh's joint, and
-    t + c / 2 turns that line backwards. In the lower pose it is 0.015 m behind the joint at the front, 0.072 m at the
-    rear. 0.32 m below it, the distance is 0.3203 and 0.3281 m: c = -2 acos(0.8009) and -2 acos(0.8202), and t is
-    atan(0.015 / 0.32) - c / 2 and atan(0.072 / 0.32) - c / 2. Of the 0.32 m, hips of 0.1 rad leave 0.310 m below the
-    trunk (0.32 cos(0.1) - 0.0838 sin(0.1)), and the foot's radius adds 0.02 m.
+    t + c / 2 turns that line backwards: 0.32 m below the joint it is 0.015 m behind it at the front, 0.072 m at the
+    rear. Hips of 0.1 rad leave 0.310 m below the trunk, and the foot's radius adds 0.02 m.
     """
 
     class init_state:
@@ -111,6 +129,7 @@ _DECAP = "legged_torque.envs.approaches.decap:DecapRobot"
 
 A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], ...] = (
     ("a1_torque", _TORQUE, A1TorqueCfg, A1TorqueCfgPPO),
+    ("a1_torque_damped", _TORQUE, A1TorqueDampedCfg, A1TorqueCfgPPO),
     ("a1_torque_gravity", _TORQUE, A1TorqueCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_gravity_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
@@ -176,6 +195,7 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
 PURPOSES = {
     "position": "joint positions under PD control",
     "torque": "joint torques",
+    "torque_damped": "torques that bear 20 ms of latency",
     "torque_gravity": "torques, from a policy that stands",
     "torque_curriculum": "torques, nominal pose comes first",
     "torque_multihead": "positions + torques, PD down to 0",

@@ -35,10 +35,10 @@ def read_curves(file: Path) -> pd.DataFrame:
     problems: list[str] = []
     try:
         texts, training = read_csv(file, problems), {}
-        if "task" not in texts:
+        table, unnamed = to_numbers(texts, file, problems), pd.Series("", texts.index)
+        if "task" not in texts and not table.empty:
             config = load_config(file.parent)
             training = {"task": config["task"], "seed": config["train"]["seed"]}
-        table, unnamed = to_numbers(texts, file, problems), pd.Series("", texts.index)
         for name, kind in {"task": str, "environment": str, "seed": int}.items():
             table[name] = kind(training[name]) if name in training else texts.get(name, unnamed).map(kind)
     except (LookupError, ValueError, TypeError, AttributeError, OverflowError) as error:

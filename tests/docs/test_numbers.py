@@ -167,7 +167,7 @@ def test_rough_ground(column):
     for policy, *numbers in rows:
         method, _, sight = policy.rpartition(", ")
         task = ROUGH[method] + ("_scan" if sight == "scan" else "")
-        chosen = data[(data["task"] == task) & (data["commit"] != "older")]
+        chosen = data[data["task"] == task]
         crossed = chosen[chosen["kind"].isin(KINDS[column])]["crossed"].mean()
         cost = chosen[chosen["kind"] == "rough_slope"]["cost_of_transport"].mean()
         values = {column: crossed, columns[-2]: chosen["track_percentage"].mean(), columns[-1]: cost}
@@ -210,6 +210,25 @@ def test_cures_of_latency(swept):
     assert f"alone give {torque.iloc[3:].mean():.3f} and {fell.iloc[3:].mean():.2f}" in text
     fast = swept.loc["policy at 200 Hz", "action_delay", "track_percentage", 0.0, "a1_torque_multihead"]
     assert f"track {fast.min():.2f} to {fast.max():.2f} without latency after" in text
+
+
+def test_other_conditions():
+    """Tracking of each seed of PD, tuned PD and default torque by condition, and falls after drops."""
+    data, text = pd.read_csv(DOCS / "results" / "robustness.csv.gz"), text_of("results.md", "- **Other conditions**")
+    data = data[data["parameter"].str.startswith("condition ")]
+    own = data[data["task"].isin(["a1_position", "a1_torque"]) & (data["metric"] == "track_percentage")]
+    of = {}  # by condition: of 10 ms, of the recipe, and of 20 ms with tuned gains
+    for name, same_condition in own.sort_values("trained").groupby("parameter"):
+        of[name[10:]] = [one.sort_values("seed")["mean"].tolist() for _, one in same_condition.groupby("trained")]
+    (double,), (damped,), (tuned,) = of["noise_doubled"]
+    assert f"PD tracks {double:.3f}, tuned for 20 ms {tuned:.3f}, the recipe {damped:.3f};" in text
+    said = [" and ".join(f"{value:.3f}" for value in of["noise_4_times"][i]) for i in (0, 2, 1)]
+    assert f", {len(data) // 3} evaluations so far" in text and f"times the noise {', '.join(said)}." in text
+    (_, nominal, (tuned,)), (shifted, (tuned_shifted,)) = of["as_trained"], of["off_centre"]
+    cost = [before - after for before, after in zip(nominal, shifted, strict=True)]
+    assert "the tuned PD {:.3f}, the recipe {:.3f} and {:.3f}.".format(tuned - tuned_shifted, *cost) in text
+    falls = data.query("parameter == 'condition drop_50_cm' and metric == 'falls_per_minute'")["mean"].max()
+    assert f"more than {falls:.2f} times" in text and f"the recipe tracks {of['dead_leg'][0][0]:.3f}." in text
 
 
 def test_tuned_gains(table_one):

@@ -197,7 +197,7 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
 
 
 def test_tiles_are_crossed_after_training(stage, tmp_path):
-    """That, a sweep and a condition are steps of their own, done again alone; other tiles in the same folder are refused."""
+    """That, a sweep and a condition are steps of their own, done again alone; other tiles are refused."""
     values = SMALL | {"tasks": ["a1_torque"], "grounds": {"kinds": ["flat", "pits"], "levels": [0, 0.5]}}
     values["sweeps"] = {"ground_friction": {"domain_rand.ground_friction": {"set": [0.4, 1.2]}}}
     values["conditions"] = {"late": {"motors.delay.range": [2, 2]}}

@@ -62,15 +62,10 @@ def test_experiment_names_other_folders(results, tmp_path):
         assert_told_in_one_line(run_here("report.py", str(results), "--out=report", root=tmp_path), "must hold names")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "[" * 2000 + "]" * 2000,
-        '{"task": "a", "seed": Infinity, "points": [{"steps": 1}]}',
-        '{"task": {}, "seed": [], "points": [[]]}',
-        '{"histograms": [], "settings": 1, "rms_error": {}, "standing": {}}',
-    ],
-)
+REPORT = '{"histograms": [], "settings": 1, "rms_error": {}, "standing": {}}'
+
+
+@pytest.mark.parametrize("text", ["[" * 2000 + "]" * 2000, REPORT], ids=["deep", "report"])
 def test_figures(tmp_path, text):
     """Figures are not drawn of JSON that is not what its script writes."""
     (tmp_path / "theirs.json").write_text(text)
