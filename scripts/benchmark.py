@@ -33,13 +33,11 @@ COLUMNS = {
     "iteration_ms": ("iteration ms", 1),
     "iteration_steps_per_s": ("steps/s", 0),
     "peak_memory_mib": ("peak MiB", 0),
-    "startup_s": ("start-up s", 1),
 }
 """Heading of each column, as wide as the column, and its number of decimals."""
 LEGEND = """\
   physics: one control step of physics alone, with its torques; step: env.step; iteration: all of it, with logging
-  steps/s: over whole iterations; peak: {memory}
-  start-up: from building the task to the end of the second iteration, when everything is compiled and captured"""
+  steps/s: over whole iterations; peak: {memory}"""
 
 
 def main() -> None:

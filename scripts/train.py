@@ -30,6 +30,7 @@ from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
 from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint_of, load_config, new_run_dir, package_versions
+from legged_torque.utils.stopwatch import stopwatch
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 from legged_torque.viewer.training_viewer import TrainingViewer
 
@@ -51,6 +52,8 @@ def main() -> None:
     parser.add_argument("--viewer", choices=("none", "web"), default="none", help=hint)
     hint = "iterations from one short video of the policy to the next, made during the training; default: no videos"
     parser.add_argument("--video_interval", type=int, default=0, metavar="N", help=hint)
+    hint = "print at the end where the seconds went, from the start of the process on"
+    parser.add_argument("--timing", action="store_true", help=hint)
     args = parser.parse_args()
     cli.check_args(args, video_interval=Number)
     options, is_first = cli.options_of(args), distributed.rank() == 0
@@ -96,8 +99,14 @@ def main() -> None:
         from legged_torque.utils.progress import CompileProgress
     viewer = TrainingViewer(is_first and args.viewer == "web", args.video_interval if is_first else 0)
     set_seed(train_cfg.seed)
-    with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
-        train(options, env_cfg, train_cfg, viewer)
+    stopwatch.lap("imports and settings")
+    try:
+        with CompileProgress() if is_first else contextlib.nullcontext():  # one line for all processes
+            train(options, env_cfg, train_cfg, viewer)
+    finally:
+        if args.timing and is_first:
+            stopwatch.lap("end")
+            print(f"Time: {stopwatch}")
 
 
 def new_settings(options: Options) -> tuple[Any, Any]:
@@ -135,6 +144,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         pretrained = pretrained_file(options.task, train_cfg, options.log_root)
         find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
     env, _ = task_registry.make_env(options.task, options, env_cfg)
+    stopwatch.lap("task")
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
         print_notes([standing_note(env)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
@@ -160,6 +170,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False
+    stopwatch.lap("networks and evaluations' worlds")
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
         is_complete = not runner.stopped_by

@@ -78,22 +78,19 @@ def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, trace
     Timed are ``rounds`` iterations, and physics and step as often. ``trace`` is a file for some iterations, or None.
 
     Returns:
-        The numbers, by names that end in their units; see :func:`summarize`. "build_s" is the time for task and runner,
-        "startup_s" that for the first two iterations as well, which compile and capture.
+        The numbers, by names that end in their units; see :func:`summarize`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        start, used = time.perf_counter(), []
+        used: list[float] = []
         with CompileProgress():
             task, runner = build(task_name, cfgs, memory.device, folder)
-            built = time.perf_counter()
             while not runner.alg.due():  # a learner may collect for a while before its first update
                 runner.collect_rollout()
             time_iterations(runner, WARM_UP, lambda number: used.append(memory.used()))
-        startup = time.perf_counter() - start
         times = time_iterations(runner, rounds)
         peak = max(*used, memory.used())
         row = summarize(times, *time_physics(task, rounds), task.num_envs, cfgs[1].runner.num_steps_per_env)
-        row |= {"peak_memory_mib": peak, "build_s": built - start, "startup_s": startup}
+        row["peak_memory_mib"] = peak
         if trace:
             row["profile"] = trace_iterations(runner, trace)
     return row

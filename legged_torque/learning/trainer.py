@@ -21,6 +21,7 @@ from legged_torque.utils.display import warn
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
+from legged_torque.utils.stopwatch import stopwatch
 
 LAST_SHARE = 0.25
 """Most control steps of an evaluation at the end of a training at which none is due, as a share of the training's."""
@@ -109,19 +110,23 @@ class Trainer:
                 asked = stop.requested or self._log.broken_pipe is not None or distributed.has_lost_parent()
                 if distributed.any_process(asked, self.device):
                     break
-                begin = time.perf_counter()
+                begin, stage = time.perf_counter(), "" if self.current_learning_iteration > first else "first iteration"
                 self.collect_rollout()
                 self._log.write()  # of the last iteration, while the device is busy with this one
                 self._wait()
                 collected = time.perf_counter()
+                stopwatch.lap(stage or "rollouts")
                 numbers = self._update(last)
+                stopwatch.lap(stage or "updates")
                 to_end = num_learning_iterations if self.current_learning_iteration + 1 == last else 0
                 measured = self._evaluate(numbers, begin, to_end) | guard.add_iteration(numbers)
                 times = {"collect_time": collected - begin, "learn_time": time.perf_counter() - collected}
+                stopwatch.lap("evaluations")
                 self._log.prepare(self.current_learning_iteration, times, numbers, measured)
                 self.current_learning_iteration += 1
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0 and not guard.problem:
                     self.save_checkpoint()
+                stopwatch.lap("logs and checkpoints")
             self.save_checkpoint()  # writes the last log too
         self.stopped_by = stop.number
         if self._log.broken_pipe:

@@ -52,7 +52,6 @@ def test_numbers_belong_together(measured):
         assert row["iteration_min_ms"] <= row["iteration_ms"] <= row["iteration_max_ms"]
         # with two rounds medians are means, which add up
         assert sum(row[f"{name}_ms"] for name in PARTS) == pytest.approx(row["iteration_ms"])
-        assert 0 < row["build_s"] < row["startup_s"]
         assert 50 < row["peak_memory_mib"] <= row["left_memory_mib"] < 50_000  # on the CPU memory only grows
 
 

@@ -103,11 +103,13 @@ def test_train_stop_resume_play(tmp_path):
 
     thread = threading.Thread(target=interrupt, daemon=True)
     thread.start()
-    status, output, error = run_here("train.py", *task, *changes, "--preset=parallel", "--num_envs=2", root=tmp_path)
+    changes += ["--preset=parallel", "--num_envs=2", "--timing"]
+    status, output, error = run_here("train.py", *task, *changes, root=tmp_path)
     thread.join()
     notes = [line for line in output.splitlines() if line.startswith("Note: ")]
     assert any("--preset laptop" in line for line in notes)  # this one takes hours
     assert status == 130 and "Traceback" not in error
+    assert re.search(r"^Time: imports and settings \S+ s, task .*, first iteration .*, end \S+ s$", output, re.M)
     (first,) = logs.iterdir()
     beginning, count = checkpoint_numbers(first)
     assert beginning == 0
