@@ -76,6 +76,7 @@ class Simulation:
         self._copper_loss = np.array([losses.get(name, 0.0) for name in policy.joint_order])
         self.has_losses = bool(self._copper_loss.any())
         self.command, self._power = np.zeros(3), np.zeros(3)
+        self._last_torques: np.ndarray | None = None  # of the episode
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
@@ -92,7 +93,7 @@ class Simulation:
         self._origin = self.robot.origins[self._rng.integers(len(self.robot.origins))]
         self._new_episode()
         self._follow_heading()
-        sums, self._last_torques = np.zeros(NUM_SUMS), np.zeros(len(self.policy.joint_order))
+        sums = np.zeros(NUM_SUMS)
         with np.errstate(over="ignore", invalid="ignore"):  # reported below, in one line
             for _ in range(num_steps):
                 command = self.command.copy()
@@ -122,7 +123,8 @@ class Simulation:
             robot.step(self._motors.apply(wanted, pos, vel))
             applied = self._motors.before_friction(robot.applied_torques())
             power = np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
-            self._power += *power, np.abs(applied - self._last_torques).mean()
+            change = 0.0 if self._last_torques is None else np.abs(applied - self._last_torques).mean()
+            self._power += *power, change
             self._last_torques = applied
             self._now += 1
             if is_late:
@@ -169,6 +171,7 @@ class Simulation:
         self._draw_command()
         self._heights.clear()
         self._steps = self._now = 0
+        self._last_torques = None
         self._actions.restart(self._rng, self.policy.last_action.copy())
         self._measurements.restart(self._rng, self._measured())
 

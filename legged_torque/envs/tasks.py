@@ -38,7 +38,7 @@ class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
 
 
 class A1TorqueDampedCfg(A1TorqueCfg):
-    """A1 with torques that bears 20 ms of latency, which it has seen, with damping on the drives; docs/results.md."""
+    """A1 with torques trained with up to 20 ms of latency and damping on the drives, see docs/results.md."""
 
     class env:
         history_length = 3
@@ -195,7 +195,7 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
 PURPOSES = {
     "position": "joint positions under PD control",
     "torque": "joint torques",
-    "torque_damped": "torques that bear 20 ms of latency",
+    "torque_damped": "torques, bear latency on a plane",
     "torque_gravity": "torques, from a policy that stands",
     "torque_curriculum": "torques, nominal pose comes first",
     "torque_multihead": "positions + torques, PD down to 0",

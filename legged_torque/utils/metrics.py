@@ -14,7 +14,8 @@ world was reset are left out, but for the count of falls.
 - electrical_power, electrical_cost: the same with copper losses, mean of sum |tau_i qd_i| + c_i tau_i^2 [W], if
   ``control.copper_loss`` gives c = R / (gear Kt)^2 [W/(N m)^2]: the current is tau / (gear Kt), and its heat I^2 R.
   No source gives R and Kt of Unitree's motors, so that a number for them is an assumption.
-- torque_rate: mean over joints of the sum of |change of torque| between physics steps, per second [N m/s].
+- torque_rate: mean over joints of the sum of |change of torque| between an episode's physics steps, per
+  second [N m/s].
 - height: mean height of the trunk's origin above the ground [m]. speed: mean horizontal speed [m/s].
 - falls_per_minute: resets that are not time-outs, per minute of one robot.
 """

@@ -143,7 +143,10 @@ def apply_perturbation(env_cfg: Any, name: str) -> None:
 
 
 def draw_only(env_cfg: Any, name: str) -> None:
-    """Let a task draw a random parameter, and no other where it draws none; an unknown name is a UserError."""
+    """Let a task draw a random parameter, and no other where it draws none; an unknown name is a UserError.
+
+    Motors draw constants of their own where parameters are drawn: those stay as they are, too.
+    """
     rand, names = env_cfg.domain_rand, env_cfg.random_parameters()
     if name not in {*names, *DELAYS, PUSH}:
         raise unknown_name("random parameter", name, [*names, *DELAYS, PUSH])
@@ -151,6 +154,9 @@ def draw_only(env_cfg: Any, name: str) -> None:
         rand.push_robots = False  # the sweep pushes
     if name in names and not rand.randomize_parameters:
         rand.randomize_parameters, rand.keep_fixed = True, [other for other in names if other != name]
+        for link in (getattr(env_cfg.motors, key) for key in env_cfg.motors.chain):
+            if hasattr(link, "draws"):
+                link.draws = {}
 
 
 def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str, Any]:

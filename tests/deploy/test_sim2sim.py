@@ -160,6 +160,7 @@ def test_power_of_all_physics_steps(policy, monkeypatch):
     data.qpos[:], data.qvel[:] = robot.data.qpos, robot.data.qvel
     sums = sum(simulation._control_step() or simulation._finish_step(simulation.command) for _ in range(20))
     work = heat = 0.0
+    change = np.abs(np.diff(np.array(applied, float), axis=0)).mean(axis=1).sum() / 0.4  # in 20 control steps
     for torques in applied:
         data.ctrl[:] = torques
         mujoco.mj_step(robot.model, data)
@@ -167,8 +168,8 @@ def test_power_of_all_physics_steps(policy, monkeypatch):
         heat += copper @ torques**2 / 4
     assert sums[0] == 20 and len(applied) == 80 and work > 1.0
     of = ratios(sums, 1.0, 0.02, simulation.has_losses)
-    power, total = of["mechanical_power"][0], of["electrical_power"][0]
-    assert (power, total) == pytest.approx((work, work + heat), rel=1e-9)
+    power, total, rate = of["mechanical_power"][0], of["electrical_power"][0], np.divide(*of["torque_rate"])
+    assert (power, total, rate) == pytest.approx((work, work + heat, change), rel=1e-9)
 
 
 def test_episodes_end(policy):

@@ -167,7 +167,7 @@ def test_rough_ground(column):
     for policy, *numbers in rows:
         method, _, sight = policy.rpartition(", ")
         task = ROUGH[method] + ("_scan" if sight == "scan" else "")
-        chosen = data[data["task"] == task]
+        chosen = data[(data["task"] == task) & (data["commit"] != "older")]
         crossed = chosen[chosen["kind"].isin(KINDS[column])]["crossed"].mean()
         cost = chosen[chosen["kind"] == "rough_slope"]["cost_of_transport"].mean()
         values = {column: crossed, columns[-2]: chosen["track_percentage"].mean(), columns[-1]: cost}
@@ -220,15 +220,26 @@ def test_other_conditions():
     of = {}  # by condition: of 10 ms, of the recipe, and of 20 ms with tuned gains
     for name, same_condition in own.sort_values("trained").groupby("parameter"):
         of[name[10:]] = [one.sort_values("seed")["mean"].tolist() for _, one in same_condition.groupby("trained")]
-    (double,), (damped,), (tuned,) = of["noise_doubled"]
-    assert f"PD tracks {double:.3f}, tuned for 20 ms {tuned:.3f}, the recipe {damped:.3f};" in text
     said = [" and ".join(f"{value:.3f}" for value in of["noise_4_times"][i]) for i in (0, 2, 1)]
-    assert f", {len(data) // 3} evaluations so far" in text and f"times the noise {', '.join(said)}." in text
+    assert f", {len(data) // 3} evaluations, mostly" in text
+    assert "PD tracks {}, tuned for 20 ms {}, the recipe {}.".format(*said) in text
     (_, nominal, (tuned,)), (shifted, (tuned_shifted,)) = of["as_trained"], of["off_centre"]
     cost = [before - after for before, after in zip(nominal, shifted, strict=True)]
     assert "the tuned PD {:.3f}, the recipe {:.3f} and {:.3f}.".format(tuned - tuned_shifted, *cost) in text
-    falls = data.query("parameter == 'condition drop_50_cm' and metric == 'falls_per_minute'")["mean"].max()
-    assert f"more than {falls:.2f} times" in text and f"the recipe tracks {of['dead_leg'][0][0]:.3f}." in text
+    falls = data.query("parameter == 'condition drop_50_cm' and metric == 'falls_per_minute'")["mean"]
+    lame = data.query("parameter == 'condition dead_leg' and metric == 'track_percentage'")["mean"]
+    assert len(falls) == 5 and f"more than {falls.max():.2f} times" in text
+    assert f"two torque policies track {lame.max():.2f} and {lame.min():.2f}." in text
+
+
+def test_repeated_trainings():
+    """The same settings and seed on another machine, by commits that train alike, give the same sweep."""
+    again = pd.read_csv(DOCS / "results" / "repeated.csv")
+    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz").query("metric == 'track_percentage'")
+    data = data[(data["parameter"] == "action_delay")].rename(columns={"from": "action_delay"})
+    both = again.merge(data, on=["task", "trained", "seed", "action_delay"])
+    assert len(both) == len(again) == 28 and (both["commit_x"] != both["commit_y"]).all()
+    assert (both["track_percentage"] == both["mean"].round(4)).all()
 
 
 def test_tuned_gains(table_one):

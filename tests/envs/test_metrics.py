@@ -50,11 +50,12 @@ def add(task, metrics, **step):
     """Write a step into the task's tensors, where they are left out as 0, and let the metrics add it."""
     places = {"lin_vel": task.base_lin_vel, "ang_vel": task.base_ang_vel, "torques": task.torques}
     places |= {"joint_vel": task.dof_vel, "height": task.base_pos[:, 2], "force": task.sim.contact_force}
+    steps = 4 * task.power.begin()  # of four physics steps, all alike
     places |= {"reset": task.reset_buf, "time_out": task.time_out_buf}
     for name, place in places.items():
         place.copy_(torch.as_tensor(step.get(name, 0)))
-    for add in 4 * task.power.begin():  # of four physics steps, all alike
-        add()
+    for add_physics_step in steps:
+        add_physics_step()
     metrics.add_step(torch.as_tensor(step["commands"], dtype=torch.float32))
 
 
@@ -82,8 +83,8 @@ def sums_by_hand(steps, dt):
             x, y, yaw = now["commands"]
             speed = math.hypot(vx, vy)
             power = sum(abs(tau * v) for tau, v in zip(now["torques"], now["joint_vel"], strict=True))
-            before = steps["torques"][t - 1, w] if t else np.zeros(12)  # also after a reset
-            change = np.abs(now["torques"] - before).mean()
+            is_first = t == 0 or steps["reset"][t - 1, w]  # of an episode
+            change = 0.0 if is_first else np.abs(now["torques"] - steps["torques"][t - 1, w]).mean()
             heat = sum(c * tau**2 for tau, c in zip(now["torques"], COPPER_OF_JOINTS, strict=True))
             result["track_xy"][:, w] += (vx - x) ** 2 + (vy - y) ** 2, 1.0
             result["track_angular"][:, w] += (yaw_rate - yaw) ** 2, 1.0
@@ -114,7 +115,7 @@ def test_every_metric_of_a_written_trajectory(task):
     steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1])
     assert steps["time_out"].any() and (steps["reset"] & ~steps["time_out"]).any()
     for seed in (1, 0):
-        add(task, metrics, commands=np.zeros((5, 3)))  # from no torque
+        add(task, metrics, commands=np.zeros((5, 3)), reset=1, torques=math.nan)  # it must not spoil the next one
         metrics.clear()
         steps = random_steps(40, task.num_envs, task.sim.contact_force.shape[1], seed)
         for t in range(40):
@@ -193,7 +194,7 @@ def test_power_of_all_physics_steps(make_task, name, torques, motors, viscous):
     torques_in_torch(measured[1])
     walking = [WalkingMetrics(task) for task in measured]
     data, rng = mujoco.MjData(plain.sim.mj_model), np.random.default_rng(0)
-    expected = np.zeros((2, 2))
+    expected, last = np.zeros((3, 2)), [None, None]
     for _ in range(12):
         actions, before = rng.normal(size=(2, 12)), [getattr(plain.sim, part).numpy().copy() for part in STATE]
         for task in (plain, *measured):
@@ -205,7 +206,9 @@ def test_power_of_all_physics_steps(make_task, name, torques, motors, viscous):
                 made = np.clip(torques(actions[world], data.qpos[7:], data.qvel[6:]), -33.5, 33.5)
                 data.ctrl[:] = made - viscous * data.qvel[6:]
                 mujoco.mj_step(plain.sim.mj_model, data)
-                expected[:, world] += np.abs(made * data.qvel[6:]).sum() / 4, COPPER_OF_JOINTS @ made**2 / 4
+                change = 0.0 if last[world] is None else np.abs(made - last[world]).mean()
+                expected[:, world] += np.abs(made * data.qvel[6:]).sum() / 4, COPPER_OF_JOINTS @ made**2 / 4, change
+                last[world] = made
         assert all(torch.equal(getattr(plain.sim, part), getattr(measured[0].sim, part)) for part in STATE)
         for part in STATE:
             getattr(measured[1].sim, part).copy_(getattr(plain.sim, part))  # rounding errors do not add up
@@ -213,8 +216,9 @@ def test_power_of_all_physics_steps(make_task, name, torques, motors, viscous):
             each.add_step(plain.commands)
     for each in walking:
         ratios = each.ratios()
-        work, total = (ratios[name][0].numpy() for name in ("mechanical_power", "electrical_power"))
-        np.testing.assert_allclose([work, total - work], expected, rtol=2e-3)
+        names = ("mechanical_power", "electrical_power", "torque_rate")
+        work, total, change = (ratios[name][0].numpy() for name in names)
+        np.testing.assert_allclose([work, total - work, change], expected, rtol=2e-3)
 
 
 def test_breakdown_by_hand(task):

@@ -20,7 +20,9 @@ def swept(make_task, name, **settings):
     from legged_torque.envs import task_registry
 
     cfg = task_registry.get_cfgs("a1_position")[0]
+    cfg.motors.chain = cfg.motors.choices["real"]  # whose voltage is drawn in training
     draw_only(cfg, name)
+    settings |= {"motors.chain": cfg.motors.chain, "motors.urdf.draws": cfg.motors.urdf.draws}
     rand = {f"domain_rand.{key}": getattr(cfg.domain_rand, key) for key in ("randomize_parameters", "keep_fixed")}
     return make_task("a1_position", 12, **QUICK, **rand, **settings)
 
@@ -42,6 +44,8 @@ def shaking(task):
 def test_parts(make_task, name, setting, ends, tensor):
     """Mean speed and number of steps of each part are those of the steps in which worlds had such values."""
     task = swept(make_task, name, **setting)
+    parameters = task.events.parameters
+    assert all(np.ptp(parameters.range_of(other)[1:]) == 0.0 for other in parameters.sizes if other != name)
     values = {
         "strength": lambda: task.motors.strength[:, 0],
         "solref": lambda: -task.sim.field("geom_solref", [0])[:, 0, 0],

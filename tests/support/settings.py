@@ -7,8 +7,8 @@ from legged_torque.utils.cli import TRAINING, Parser, add_options, add_task_args
 from legged_torque.utils.errors import UserError
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_gravity", "a1_torque_curriculum", "a1_torque_multihead", "a1_multihead"]
-COMBINATIONS = ["a1_torque_curriculum_multihead", "a1_multihead_two_rates", "a1_torque_gravity_curriculum"]
-COMBINATIONS += ["a1_torque_gravity_multihead", "a1_torque_curriculum_high"]
+COMBINATIONS = ["a1_torque_curriculum_multihead", "a1_multihead_two_rates", "a1_torque_damped"]
+COMBINATIONS += ["a1_torque_gravity_curriculum", "a1_torque_gravity_multihead", "a1_torque_curriculum_high"]
 COMBINATIONS += ["a1_variable_stiffness", "a1_decap", "a1_sata"]
 ROUGH = [f"a1_rough_{name[3:]}{scan}" for name in TASKS + COMBINATIONS for scan in ("", "_scan")]
 APPROACHES = ["position", "torque", "torque_gravity", "torque_curriculum", "torque_multihead", "multihead"]

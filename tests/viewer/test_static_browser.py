@@ -39,7 +39,8 @@ const [usual, refresh] = [policy.motors, policy.timing.refresh_torques];
   done([Array.from(simulation.robot.data.qpos), simulation.torques]);
 })();
 """
-ADAPT = "for (let i = 1e5; i--; ) scene.adapt(arguments[0]); return [scene.coarsest, scene.finest].indexOf(scene.ratio)"
+ADAPT = "[scene.coarsest, scene.finest] = [0.3, 1]; for (let i = 1e5; i--; ) scene.adapt(arguments[0]); "
+ADAPT += "return [scene.coarsest, scene.finest].indexOf(scene.ratio)"
 
 
 @pytest.fixture(scope="module", params=POLICIES)

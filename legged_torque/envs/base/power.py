@@ -20,7 +20,8 @@ class PowerMeter:
     Attributes:
         is_on: Whether steps are measured; trainings do without. See :meth:`BaseTask.measure_power`.
         mechanical: Sum over joints of |torque times velocity| [W]; NaN before the first step. Shape: (num_envs,).
-        torque_change: Sum over physics steps of the mean over joints of |change of torque| [N m]. Shape: (num_envs,).
+        torque_change: Sum over an episode's physics steps of the mean over joints of |change of torque| [N m]. Shape:
+            (num_envs,).
         copper: Heat in the windings, sum over joints of copper_loss times squared torque [W]. Shape: (num_envs,).
         copper_loss: Heat per squared torque of each joint [W/(N m)^2]. Shape: (num_dof,).
         has_losses: Whether any joint has copper losses.
@@ -37,7 +38,7 @@ class PowerMeter:
         self.copper_loss, self.has_losses = torch.tensor(losses, device=state.device), any(losses)
         self.mechanical = torch.full((state.num_envs,), torch.nan, device=state.device)
         self.copper, self.torque_change = torch.zeros_like(self.mechanical), torch.zeros_like(self.mechanical)
-        self._last_torques = torch.zeros_like(state.torques)
+        self._last_torques, self._has_last = torch.zeros_like(state.torques), torch.zeros_like(state.reset_buf)
 
     def begin(self) -> list[Callable[[], None]]:
         """Begin a control step; return what to call after each physics step, if it is measured."""
@@ -46,13 +47,16 @@ class PowerMeter:
         self.mechanical.zero_()
         self.copper.zero_()
         self.torque_change.zero_()
+        torch.logical_not(self._state.reset_buf, out=self._has_last)
         return [self._add_step]
 
     def _add_step(self) -> None:
         """Add the physics step that has just been made."""
         torques, vel = self._motors.before_friction(self._state.torques), self._state.dof_vel
-        self.torque_change.add_((torques - self._last_torques).abs().mean(dim=1))
+        change = (torques - self._last_torques).abs().mean(dim=1)
+        self.torque_change.add_(torch.where(self._has_last, change, 0.0))
         self._last_torques.copy_(torques)
+        self._has_last.fill_(True)
         self.mechanical.add_((torques * vel).abs().sum(dim=1), alpha=self._share)
         if self.has_losses:
             self.copper.add_(torques.square() @ self.copper_loss, alpha=self._share)

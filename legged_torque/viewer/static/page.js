@@ -127,7 +127,7 @@ async function main() {
     frames += 1;
     if (now - since > 500) {
       const passed = (now - since) / 1000;
-      scene.adapt(passed / frames);
+      if (passed < 1) scene.adapt(passed / frames); // else the page was hidden
       show((simulation.time - simulated) / passed, frames / passed);
       [since, simulated, frames] = [now, simulation.time, 0];
     }

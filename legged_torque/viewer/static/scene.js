@@ -9,7 +9,8 @@ const HAZE = new THREE.Color(0xdfe6ee); // the sky, and the floor far away
 const SHARP = 0.7; // faces that meet at a larger angle [rad] have an edge
 const DRAWN_GROUPS = 3; // MuJoCo hides the others
 const LATE = 1 / 55; // frames that take longer [s] on average get fewer pixels
-const [STEP, PATIENCE] = [0.8, 4]; // of pixels per unit of length; calls of adapt() without a late one before more pixels
+const STEP = 0.8; // of pixels per unit of length
+const [PATIENCE, LONGEST] = [4, 64]; // calls of adapt() on time before there are more pixels, at first and at most
 const TURNED = new THREE.Matrix4().makeRotationX(Math.PI / 2); // three's cylinders are along y, MuJoCo's along z
 
 export class Scene {
@@ -58,12 +59,12 @@ export class Scene {
   }
 
   /** Draws with fewer pixels from now on if frames take long [s], and with more once they have been on time for a while,
-   * which is twice as long after each late one. */
+   * which is twice as long after each time that there were too many. */
   adapt(frameTime) {
     this.onTime = frameTime > LATE ? 0 : this.onTime + 1;
     if (!this.onTime && this.ratio > this.coarsest) {
       this.ratio = Math.max(STEP * this.ratio, this.coarsest);
-      this.patience *= 2;
+      this.patience = Math.min(2 * this.patience, LONGEST);
     } else if (this.onTime > this.patience) {
       this.ratio = Math.min(this.ratio / STEP, this.finest);
       this.onTime = 0;
