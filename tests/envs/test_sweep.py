@@ -44,7 +44,7 @@ def shaking(task):
 def test_parts(make_task, name, setting, ends, tensor):
     """Mean speed and number of steps of each part are those of the steps in which worlds had such values."""
     task = swept(make_task, name, **setting)
-    parameters, others = task.events.parameters, task.cfg.domain_rand.randomize_parameters  # for a delay, nothing else is
+    parameters, others = task.events.parameters, task.cfg.domain_rand.randomize_parameters  # not for a delay
     assert not any(others and np.ptp(parameters.range_of(each)[1:]) for each in parameters.sizes if each != name)
     values = {
         "strength": lambda: task.motors.strength[:, 0],
