@@ -6,7 +6,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import evaluator
 
 COLUMNS = "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,"
-COLUMNS += "mechanical_power,height,speed,falls_per_minute,critic_gradient_norm"
+COLUMNS += "mechanical_power,torque_rate,height,speed,falls_per_minute,critic_gradient_norm"
 
 
 def read_rows(file):

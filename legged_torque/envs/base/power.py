@@ -48,6 +48,7 @@ class PowerMeter:
         self.copper.zero_()
         self.torque_change.zero_()
         torch.logical_not(self._state.reset_buf, out=self._has_last)
+        self._last_torques.copy_(self._motors.before_friction(self._state.torques))
         return [self._add_step]
 
     def _add_step(self) -> None:
