@@ -38,7 +38,7 @@ class A1TorqueCfgPPO(torque.TorqueCfgPPO, A1CfgPPO):
 
 
 class A1TorqueDampedCfg(A1TorqueCfg):
-    """A1 with torques trained with up to 20 ms of latency and damping on the drives, see docs/results.md."""
+    """A1 with torques, trained with up to 20 ms of latency and damping on the drives, see docs/results.md."""
 
     class env:
         history_length = 3
