@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE, Cell, Matrix, read_plan
+from legged_torque.experiments.matrix import CONDITION, ROUGH_GROUND, SETTINGS_FILE, SWEEP, Cell, Matrix, read_plan
 from legged_torque.paper.report.evaluations import COLUMNS, METRIC_NAMES, read_evaluations
 from legged_torque.paper.report.unplanned import find_trainings, plan_of, ranges_of
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
@@ -36,6 +36,8 @@ class Training:
     evaluations: dict[str, pd.DataFrame] = field(default_factory=dict)  # while it trained, by environment
     results: dict[str, pd.DataFrame] = field(default_factory=dict)  # one row: last checkpoint, by environment
     crossings: pd.DataFrame | None = None  # kind, level, MEASURES: last checkpoint, a row per tile of rough ground
+    conditions: dict[str, float] = field(default_factory=dict)  # tracking of the last checkpoint, by condition
+    sweeps: dict[str, pd.DataFrame] = field(default_factory=dict)  # of the last checkpoint: as read_sweep, by parameter
     configs: list[dict[str, Any]] = field(default_factory=list)  # config.yaml of its runs
     devices: set[str] = field(default_factory=set)  # that trained and evaluated it
     problems: list[str] = field(default_factory=list)  # of its files
@@ -56,6 +58,11 @@ class Training:
         config = self.configs[-1] if self.configs else {}
         steps, iterations = steps_per_iteration(config), config.get("max_iterations")
         return steps * iterations if steps is not None and type(iterations) is int else PAPER_STEPS
+
+    def measured(self) -> set[str]:
+        """Return the names of the further evaluations of the last checkpoint that there are."""
+        names = {SWEEP + name for name in self.sweeps} | {CONDITION + name for name in self.conditions}
+        return names | (set() if self.crossings is None else {ROUGH_GROUND})
 
     def is_finished(self, steps: float) -> bool:
         """Return whether fewer steps are left than lie between two evaluations."""
@@ -186,7 +193,8 @@ def read_training(cell: Cell, runs: list[Path]) -> Training:
                 before = training.evaluations.get(name, rows[:0])
                 kept = before[before["steps"] < rows["steps"].iloc[0]]
                 training.evaluations[name] = pd.concat([kept, rows], ignore_index=True)
-    files = [*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json"), cell.result_file(ROUGH_GROUND)]
+    files = [*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]
+    files += {cell.result_file(name) for name in (ROUGH_GROUND, *cell.further)}
     for file in sorted(file for file in files if file.is_file()):
         try:
             read_result(training, file)
@@ -206,10 +214,25 @@ def read_result(training: Training, file: Path) -> None:
             tiles[name] = [estimate["mean"] for estimate in estimates]
         training.crossings = tiles.astype({"kind": str, "level": float, **dict.fromkeys(MEASURES, float)})
         return
+    if "sweep" in values:
+        training.sweeps[values["sweep"]["parameter"]] = read_sweep(values["sweep"])
+        return
     means = {name: estimate.get("mean") for name, estimate in values["metrics"].items()}
+    if file.stem.startswith("condition_"):
+        training.conditions[file.stem.removeprefix("condition_")] = float(means["track_percentage"])
+        return
     row = pd.DataFrame([{"steps": int(values["steps"]), **means}]).reindex(columns=COLUMNS).astype(float)
     environment = file.stem.removeprefix("result_")
     before = training.results.get(environment)
     if before is None or row["steps"].iloc[0] >= before["steps"].iloc[0]:
         training.results[environment] = row.replace([np.inf, -np.inf], np.nan)
     training.devices.add(str(values.get("device")))
+
+
+def read_sweep(sweep: dict[str, Any]) -> pd.DataFrame:
+    """Return the parts of a sweep: at, value, unit, and is_push; see :mod:`~legged_torque.paper.report.robustness`."""
+    parts, is_delay = sweep["parts"], sweep["parameter"].endswith("_delay")
+    at = [part["from"] if is_delay else (part["from"] + part["to"]) / 2.0 for part in parts]
+    values = [part["fell"] if "fell" in part else part["metrics"]["track_percentage"] for part in parts]
+    table = pd.DataFrame({"at": at, "value": [value["mean"] for value in values]}, dtype=float)
+    return table.assign(unit=sweep["unit"], is_push="fell" in parts[0])

@@ -14,7 +14,7 @@ import yaml
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from legged_torque.experiments.matrix import ROUGH_GROUND, SETTINGS_FILE
+from legged_torque.experiments.matrix import SETTINGS_FILE
 from legged_torque.experiments.times import describe, read_times
 from legged_torque.paper.metrics import COMPARED, PAPER_METRICS
 from legged_torque.paper.report import tables
@@ -22,6 +22,7 @@ from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.figures_curves import FEW
+from legged_torque.paper.report.robustness import condition_table, findings, sweep_figures, sweep_title
 from legged_torque.paper.report.style import in_words, method, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
@@ -49,7 +50,7 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
     table = summarize(experiment, from_step)
     differences, configs = tables.find_differences(experiment, table), first_configs(experiment)
     planned, rough = planned_figures(experiment, table, differences), rough_figures(experiment)
-    drawn = draw_all(experiment, planned | rough, out)
+    drawn = draw_all(experiment, planned | rough | sweep_figures(experiment), out)
     signs = {name: int((table["sign"] == sign).sum()) for sign, name in CLASSES.items()}
     values = {
         "title": f"Results of {experiment.folder.resolve().name}",
@@ -66,6 +67,12 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "figures": [title for title in planned if title in drawn],
         "absent_figures": [title for title in planned if title not in drawn],
         "rough_figures": [title for title in rough if title in drawn],
+        "conditions": {name: condition_table(experiment, name) for name in experiment.plan.environments},
+        "sweeps": [
+            (title, findings(experiment, name, environment))
+            for environment, name in product(experiment.plan.environments, experiment.plan.sweeps)
+            if (title := sweep_title(name, environment)) in drawn
+        ],
         "setup": setup_lines(experiment),
         "plan": (experiment.folder / SETTINGS_FILE).read_text("utf-8", "replace") if experiment.is_planned else "",
         "folders": [portable_path(experiment.folder), portable_path(out)],
@@ -134,9 +141,8 @@ def run_problems(run: Training, from_step: float) -> list[str]:
             problems.append(f"not evaluated in {in_words(name)}")
         elif not run.is_finished(steps := rows["steps"].iloc[-1]):
             problems.append(f"evaluated in {in_words(name)} after {steps / MILLION:.4g} of {total}")
-    if ROUGH_GROUND in run.cell.further and run.crossings is None:
-        problems.append(f"not evaluated on {ROUGH_GROUND}")
-    return problems
+    absent = [name for name in run.cell.further if name not in run.measured()]
+    return problems + ([f"not evaluated: {', '.join(absent)}"] if absent else [])
 
 
 def setup_lines(experiment: Experiment) -> list[str]:
