@@ -11,6 +11,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from legged_torque.envs.base.symmetry import with_mirror_images
+from legged_torque.learning.ppo.cpu_ppo import CpuPPO
+from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import counterparts
 
@@ -140,6 +142,21 @@ def test_losses_of_an_update(make_runner, name):
     assert losses["kl"] == pytest.approx(float(kl), rel=1e-4)
     assert losses["surrogate"] == pytest.approx(float(surrogate), rel=1e-4, abs=1e-5)
     assert losses["value"] == pytest.approx(float(value), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
+@pytest.mark.parametrize("augmentation", [True, False])
+def test_losses_on_a_cpu(make_runner, name, augmentation):
+    """They and their gradients are those of torch's operations."""
+    runner = make_runner(name, augmentation=augmentation)
+    roll_out(runner)
+    found = []
+    for kind in (CpuPPO, TorchPPO):
+        runner.alg.optimizer.zero_grad()
+        loss, numbers = kind.loss(runner.alg)
+        loss.backward()
+        found.append([numbers, *(parameter.grad for parameter in runner.alg._parameters)])
+    torch.testing.assert_close(*found, rtol=1e-4, atol=1e-6)
 
 
 class Symmetrized(nn.Module):

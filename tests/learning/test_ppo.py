@@ -23,9 +23,11 @@ from support.rollouts import (
     steps_taken,
 )
 from support.settings import error_of
+from torch import nn
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.ppo import LOSS_NAMES
+from legged_torque.learning.ppo.cpu_ppo import run_network
 
 
 def pair_with_rollout(shift=0.0, **settings):
@@ -315,3 +317,10 @@ def test_undone_first_update():
         torch.manual_seed(5)
         each.update()
     assert_same_state(state_of(alg), state_of(twin), rtol=0.0, atol=0.0)
+
+
+def test_elu_on_a_cpu():
+    """It is torch's to a rounding error of 1, also of numbers that are not finite."""
+    values = torch.tensor([-math.inf, -200.0, -1.0, -1e-4, -1e-9, 0.0, 1e-9, 3.0, math.inf, math.nan])
+    found = run_network([nn.ELU()], values.clone())
+    torch.testing.assert_close(found, nn.functional.elu(values), rtol=0.0, atol=1.2e-7, equal_nan=True)

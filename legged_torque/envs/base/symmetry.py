@@ -105,7 +105,7 @@ class Mirror:
     def __call__(self, name: str, values: Tensor) -> Tensor:
         """Return the mirror image of "policy", "critic" or "actions". Shape: (samples, size)."""
         order, signs = self.maps[name]
-        return values[:, order] * signs
+        return values.index_select(1, order) * signs
 
 
 def with_mirror_images(

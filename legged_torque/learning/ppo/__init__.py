@@ -1,4 +1,4 @@
-"""Proximal policy optimization, with torch's operations or, where they can do it, with Triton's kernels."""
+"""Proximal policy optimization, with torch's operations or, where it can be done, in ways that suit the device."""
 
 from typing import Any
 
@@ -9,6 +9,7 @@ from rsl_rl.storage import RolloutStorage
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.ppo.cpu_ppo import CpuPPO
 from legged_torque.learning.ppo.torch_ppo import LOSS_NAMES as LOSS_NAMES
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton.networks import read_network
@@ -16,14 +17,16 @@ from legged_torque.sim.compiled import has_triton
 
 
 class OnDevicePPO(TorchPPO):
-    """The PPO that settings name; :meth:`construct_algorithm` chooses Triton's kernels where that is possible."""
+    """The PPO that settings name; :meth:`construct_algorithm` chooses what suits the device where that is possible."""
 
     @classmethod
     def make(cls, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> TorchPPO:
-        """Return the algorithm with Triton's kernels on a GPU that can run them, if they know all of its parts."""
+        """Return the algorithm for CPUs or, on a GPU that can run them, with Triton's kernels, if all is known."""
         alg = cls(actor, critic, storage, **settings)
-        if not has_triton(alg.device) or not has_kernels(alg):
+        if not has_kernels(alg):
             return alg
+        if not has_triton(alg.device):
+            return CpuPPO(actor, critic, storage, **settings) if torch.device(alg.device).type == "cpu" else alg
         from legged_torque.learning.ppo.triton.triton_ppo import TritonPPO, can_multiply  # imports Triton
 
         dtype = torch.bfloat16 if alg.use_mixed_precision else torch.float32
@@ -31,7 +34,7 @@ class OnDevicePPO(TorchPPO):
 
 
 def has_kernels(alg: TorchPPO) -> bool:
-    """Return whether there are kernels for all parts of an algorithm; there are none for classes of a user's."""
+    """Return whether Triton's kernels and the code for CPUs know all parts of an algorithm; none of a user's."""
     models, symmetry = (alg.actor, alg.critic), alg.symmetry
     return (
         type(alg) is OnDevicePPO

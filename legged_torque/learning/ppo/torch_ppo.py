@@ -78,7 +78,8 @@ class TorchPPO(PPO):
         self.annealing_start, self._first_rate = annealing_start, learning_rate
         self.kl_target = torch.tensor(self.desired_kl or 0.0, device=self.device)  # of the adaptive learning rate
         self.entropy_weight = torch.tensor(self.entropy_coef, device=self.device)
-        self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self._parts = [list(model.parameters()) for model in (self.actor, self.critic)]  # each is clipped by itself
+        self._parameters = [*self._parts[0], *self._parts[1]]
         make_optimizer = type(self.optimizer)
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
@@ -224,8 +225,11 @@ class TorchPPO(PPO):
         if self.symmetry:
             self.symmetry.augment_batch(batch, self.batch_size)
         self.actor(batch.observations, stochastic_output=True)
+        return self._losses(batch, self.critic(batch.observations))
+
+    def _losses(self, batch: RolloutStorage.Batch, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what :meth:`loss` does, from the samples, their values and the actor's distribution of actions."""
         log_prob = self.actor.get_output_log_prob(batch.actions)
-        values = self.critic(batch.observations)
         entropy = self.actor.output_entropy.mean()
         with torch.no_grad():  # from the policy that acted, without mirror images
             params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
@@ -250,7 +254,8 @@ class TorchPPO(PPO):
         """Take one gradient step on the samples of ``indices``."""
         loss, numbers = self.loss()
         kl = numbers[3]
-        self.optimizer.zero_grad()
+        for parameter in self._parameters:
+            parameter.grad = None
         loss.backward()
         if self.is_multi_gpu:
             distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
@@ -260,8 +265,7 @@ class TorchPPO(PPO):
             factor = torch.where(lower, 1.0 / 1.5, torch.where(higher, 1.5, 1.0))
             factor = torch.where(self.actor_learns.bool(), factor, 1.0)  # a fixed policy has no divergence
             self.learning_rate.mul_(factor).clamp_(*self.learning_rates)
-        models = (self.actor, self.critic)  # each is clipped by itself
-        norms = torch.stack([nn.utils.clip_grad_norm_(m.parameters(), self.max_grad_norm) for m in models])
+        norms = torch.stack([nn.utils.clip_grad_norm_(part, self.max_grad_norm) for part in self._parts])
         gradient_norm = torch.linalg.vector_norm(norms)
         self._skip.copy_(~torch.isfinite(gradient_norm))
         self.optimizer.step()
@@ -271,20 +275,29 @@ class TorchPPO(PPO):
 
     def _gather(self) -> RolloutStorage.Batch:
         """Return the samples of ``indices`` from the stored rollout."""
-        storage, indices = self.storage, self.indices
-
-        def pick(tensor: Tensor) -> Tensor:
-            return tensor.flatten(0, 1).index_select(0, indices)
-
-        advantages = pick(storage.advantages)
+        storage = self.storage
+        batch = self._gather_results(self._pick(storage.actions))
+        groups = {key: self._pick(value) for key, value in storage.observations.items()}
+        batch.observations = TensorDict(groups, [len(self.indices)])
         if self.normalize_advantage_per_mini_batch:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+            advantages = batch.advantages
+            batch.advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        return batch
+
+    def _gather_results(self, actions: Tensor, images: int = 1) -> RolloutStorage.Batch:
+        """Return samples without observations: their actions, and what is the same for so many images of each."""
+        storage = self.storage
+        columns = (storage.actions_log_prob, storage.values, storage.advantages, storage.returns)
+        log_prob, values, advantages, returns = (self._pick(column).repeat(images, 1) for column in columns)
         return RolloutStorage.Batch(
-            observations=TensorDict({key: pick(value) for key, value in storage.observations.items()}, [len(indices)]),
-            actions=pick(storage.actions),
-            values=pick(storage.values),
+            actions=actions,
+            values=values,
             advantages=advantages,
-            returns=pick(storage.returns),
-            old_actions_log_prob=pick(storage.actions_log_prob),
-            old_distribution_params=tuple(pick(params) for params in storage.distribution_params),
+            returns=returns,
+            old_actions_log_prob=log_prob,
+            old_distribution_params=tuple(self._pick(params) for params in storage.distribution_params),
         )
+
+    def _pick(self, tensor: Tensor) -> Tensor:
+        """Return the rows of ``indices`` of what is stored for all steps and worlds."""
+        return tensor.flatten(0, 1).index_select(0, self.indices)
