@@ -1,46 +1,19 @@
 """The tables of the documents, recomputed from the raw data beside them."""
 
 import json
-import re
 from itertools import product
-from pathlib import Path
 
 import pandas as pd
 import pytest
-from scipy import stats
+from support.documents import DOCS, METRICS, TASKS, iqm, rows_of, same, text_of
 
 from legged_torque.paper.report.tables import holm, welch
 from legged_torque.paper.values import TABLE_I
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
-TASKS = {
-    "PD": "a1_position",
-    "default torque": "a1_torque",
-    "gravity pre-training": "a1_torque_gravity",
-    "torque curriculum": "a1_torque_curriculum",
-    "torque multi-head": "a1_torque_multihead",
-    "multi-head": "a1_multihead",
-    "curriculum, torque multi-head": "a1_torque_curriculum_multihead",
-}
-METRICS = ["track_percentage", "track_xy", "track_angular", "cost_of_transport"]
 ROUGH = {name: task.replace("a1_", "a1_rough_") for name, task in TASKS.items()}
 KINDS = {name: [name.replace(" ", "_")] for name in ("stairs up", "stairs down", "stepping stones", "gaps", "pits")}
 KINDS |= {"obstacles": ["discrete_obstacles"]}
 KINDS |= {"slopes, waves, flat": ["flat", "smooth_slope_up", "smooth_slope_down", "rough_slope", "waves"]}
-
-
-def text_of(page, heading):
-    """A page from a heading on, in one line."""
-    return " ".join((DOCS / page).read_text("utf-8").partition(heading)[2].split())
-
-
-def rows_of(page, header):
-    """Columns and rows of the table of a page that begins with a header, as lists of texts."""
-    lines = (DOCS / page).read_text("utf-8").splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith(f"| {header} |"))
-    end = next(i for i in range(start, len(lines)) if not lines[i].startswith("|"))
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[start:end]]
-    return cells[0], cells[2:]
 
 
 def means(file):
@@ -50,22 +23,11 @@ def means(file):
     return data.groupby(["task", "environment", "seed"]).mean().groupby(["task", "environment"]).mean()
 
 
-def same(text, value):
-    """Whether a number is a value, rounded."""
-    return abs(float(text) - value) <= 0.5 * 10.0 ** -len(text.partition(".")[2]) + 1e-9
-
-
 @pytest.fixture(scope="module")
 def table_one():
     """Table I: the number of each seed, by environment and task."""
     data = pd.read_csv(DOCS / "results" / "evaluations.csv.gz").query("steps >= 90e6").drop(columns="steps")
     return data.groupby(["environment", "task", "seed"]).mean()
-
-
-def iqm(values):
-    """Interquartile mean: without a quarter of the values, rounded down, at each end."""
-    out = len(values) // 4
-    return values.sort_values().iloc[out : len(values) - out].mean()
 
 
 def test_table_one(table_one):
@@ -191,102 +153,6 @@ def test_rough_ground_with_latency():
     )
 
 
-@pytest.fixture(scope="module")
-def swept():
-    """Sweeps of newly trained A1s."""
-    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz")
-    return data.set_index(["trained", "parameter", "metric", "from", "task"]).sort_index(kind="stable")["mean"]
-
-
-def trained_as(policy):
-    """How a policy of a table was trained, as the data have it, and its task."""
-    tasks = TASKS | {"variable stiffness": "a1_variable_stiffness", "decaying PD bias": "a1_decap"}
-    more = {"tuned": "tuned gains", "damping": "damping on the drive", "history": "history of 3"}
-    method, late, how = re.fullmatch(r"(.+), (\d+ ms)((?:, \w+)*)", policy.strip("*")).groups()
-    trained = ", ".join([f"late by 0 to {late}", *(more[each] for each in how.split(", ")[1:])])
-    return {"late by 0 to 10 ms, damping on the drive": "damping on the drive"}.get(trained, trained), tasks[method]
-
-
-def test_cures_of_latency(swept):
-    """Lowest and highest seed by latency and training, and of falls after pushes; the best against tuned PD."""
-    columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
-    columns += [("push_velocity", "fell", 3.5)]
-    _, rows = rows_of("results.md", "policy, latest actions in training")
-    assert len(rows) == 16
-    for policy, seeds, *cells in rows:
-        trained, task = trained_as(policy)
-        for cell, column in zip(cells, columns, strict=True):
-            values = swept.loc[(trained, *column, task)]
-            low, high = cell.split(", ")
-            assert len(values) == int(seeds) and same(low, values.min()) and same(high, values.max()), (policy, column)
-    text = text_of("results.md", "- **Default torque control can")
-    recipe, tuned = "late by 0 to 20 ms, damping on the drive, history of 3", "late by 0 to 20 ms, tuned gains"
-    _, torque, later, fell = (swept.loc[(recipe, *column, "a1_torque")] for column in columns)
-    _, position, later_pd, fell_pd = (swept.loc[(tuned, *column, "a1_position")] for column in columns)
-    test = stats.ttest_ind(torque, position, equal_var=False)
-    (low, high), change = test.confidence_interval(), torque.mean() - position.mean()
-    assert f"tracks {torque.mean():.3f}, PD, tuned and trained with it, {position.mean():.3f}" in text
-    assert f"(difference {change:.3f}, 95% interval {low:.3f} to {high:.3f})" in text
-    assert f"over {fell.mean():.2f} instead of {fell_pd.mean():.2f} (p = {welch(fell, fell_pd):.3f};" in text
-    assert f"tracks {later_pd.mean() - later.mean():.3f} less" in text
-    assert f"alone give {torque.iloc[3:].mean():.3f} and {fell.iloc[3:].mean():.2f}" in text
-    fast = swept.loc["policy at 200 Hz", "action_delay", "track_percentage", 0.0, "a1_torque_multihead"]
-    assert f"track {fast.min():.2f} to {fast.max():.2f} without latency after" in text
-
-
-def test_other_conditions():
-    """Tracking by condition, its range as trained, how fast torques change, and what the sentences say of them."""
-    data, text = pd.read_csv(DOCS / "results" / "robustness.csv.gz"), text_of("results.md", "**Other conditions**")
-    data = data[data["parameter"].str.startswith("condition ")].sort_values("seed")
-    columns, rows = rows_of("results.md", "policy | as trained")
-    rates, lost = {}, {}
-    for policy, tracking, rate, *cells in rows:
-        trained, task = trained_as(policy)
-        own = data[(data["trained"] == trained) & (data["task"] == task)]
-        of = {key: values.tolist() for key, values in own.groupby(["parameter", "metric"])["mean"]}
-        nominal, rates[task, trained] = (
-            of["condition as_trained", name] for name in ("track_percentage", "torque_rate")
-        )
-        assert tracking == f"{min(nominal):.3f}, {max(nominal):.3f}"
-        assert rate == f"{min(rates[task, trained]):.0f}, {max(rates[task, trained]):.0f}"
-        for column, cell in zip(columns[3:], cells, strict=True):
-            name = column.replace("x 4", "4_times").replace("drop 50 cm", "drop_50_cm").replace(" ", "_")
-            values = of.get((f"condition {name}", "track_percentage"), [])
-            assert cell == (f"{values[0]:.3f}" if values else "–"), (policy, column)
-            lost[task, name] = lost.get((task, name), nominal[0] - values[0] if values else 0.0)
-    assert len(rows) == 9
-    base = {task: of for (task, trained), of in rates.items() if trained == "late by 0 to 10 ms"}
-    tests = holm(
-        [welch(pd.Series(base[task]), pd.Series(base["a1_position"])) for task in base if task != "a1_position"]
-    )
-    slow = {
-        task for task, test in zip([task for task in base if task != "a1_position"], tests, strict=True) if test < 0.05
-    }
-    assert slow == {"a1_torque_multihead", "a1_torque", "a1_decap"} and max(map(max, map(base.get, slow))) < 84
-    names = ("a1_torque_curriculum", "a1_position", "a1_torque")
-    said = [f"{lost[name, 'off_centre']:.3f}" for name in names]
-    assert "the curriculum loses {} of tracking, PD {}, default torque {}.".format(*said) in text
-    falls = data[(data["parameter"] == "condition drop_50_cm") & (data["metric"] == "falls_per_minute")]["mean"]
-    assert len(falls) == 8 and f"eight policies fell at most {falls.max():.2f} times a minute" in text
-
-
-def test_repeated_trainings():
-    """The same settings and seed on another machine, by commits that train alike, give the same sweeps."""
-    again, key = pd.read_csv(DOCS / "results" / "repeated.csv.gz"), ["task", "trained", "seed", "parameter", "from"]
-    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz").query("metric == 'track_percentage'")
-    for each in (again, data):
-        each["from"] = each["from"].round(3)
-    both = again.merge(data, on=key)
-    apart = (both["track_percentage"] - both["mean"].round(4)).abs()
-    latency = both["parameter"].str.endswith("_delay")
-    assert len(both) == len(again) and (both["commit_x"] != both["commit_y"]).all()
-    assert len(both[latency].groupby(key[:3])) == 28 and apart[latency].max() < 1e-6
-    text, voltage = text_of("results.md", "## What policies bear"), apart[~latency]
-    assert f"28 trainings, repeated with {again['commit'].unique().item()}" in text
-    assert f"seed 1 of five approaches tracks the same to {voltage.max():.3f}." in text
-    assert again[again["parameter"] == "trunk_mass"]["task"].nunique() == 5
-
-
 def test_tuned_gains(table_one):
     """How many settings of PD were tried with how many seeds, which came out, and what it tracks."""
     data, settings = pd.read_csv(DOCS / "results" / "pd_gains.csv"), ["stiffness", "damping", "action_scale"]
@@ -297,31 +163,6 @@ def test_tuned_gains(table_one):
     own, tuned = table_one.loc["low", "a1_position"]["track_percentage"], data[data["seed"] <= 5]["track_percentage"]
     said = f"With seeds 1 to 5, it tracks {iqm(tuned):.3f}, PD of ten seeds {iqm(own):.3f}."
     assert len(tuned) == 5 and said in text_of("results.md", "**PD was tuned**")
-
-
-def test_what_policies_bear(swept):
-    """What the sentences say: latency of seven approaches, pushes and payload of five, energy of two."""
-    text, base = text_of("results.md", "## What policies bear"), swept.loc["late by 0 to 10 ms"]
-    pushed = base.loc["push_velocity", "fell", 3.5].groupby("task").mean()
-    names = ("position", "torque", "torque_multihead", "torque_curriculum_multihead", "torque_curriculum")
-    words = "{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
-    words += "the combination and {:.2f} under the curriculum"
-    assert words.format(*pushed[[f"a1_{name}" for name in names]]) in text
-    late = base.loc["action_delay", "track_percentage", 6.0]
-    others = [f"a1_{name}" for name in names[1:]]
-    position, torque, decap = late["a1_position"], late[others], late["a1_decap"]
-    assert f"PD tracks {position.min():.2f} to {position.max():.2f}, variable stiffness as much" in text
-    assert abs(late["a1_variable_stiffness"].mean() - position.mean()) < 0.01
-    assert f"PD bias {decap.min():.2f} to {decap.max():.2f}, and the other four" in text
-    assert f"approaches {torque.min():.2f} to {torque.max():.2f}. - **Pushes**" in text
-    masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
-    costs = masses.iloc[0] - masses.iloc[-1]
-    low, high = costs[others].min(), costs[others].max()
-    assert f"costs PD {costs['a1_position']:.3f}" in text and f"these four {low:.3f} to {high:.3f}. From" in text
-    for steps in (0.0, 2.0):
-        for task in ("a1_torque_multihead", "a1_position"):
-            energy = base.loc["action_delay", "cost_of_transport", steps, task]
-            assert f"{energy.min():.3f} to {energy.max():.3f}" in text
 
 
 def test_learners():
@@ -394,7 +235,7 @@ def test_performance():
 
 def test_g1():
     """The last 18% of four seeds."""
-    data = pd.read_csv(DOCS / "results" / "g1.csv").query("steps >= 0.82 * 2238 * 98304")
+    data = pd.read_csv(DOCS / "results" / "g1.csv.gz").query("steps >= 0.82 * 2238 * 98304")
     numbers = data.groupby("seed")["track_percentage"].mean()
     text = text_of("robots.md", "## Results")
     assert "{:.3f}, {:.3f}, {:.3f} and {:.3f}. In `low`".format(*numbers) in text and len(numbers) == 4
@@ -406,12 +247,16 @@ def test_few_worlds():
     data = pd.read_csv(DOCS / "results" / "laptop_settings.csv.gz").fillna({"other": ""})
     columns = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
     walking = data[data["track_percentage"] >= 0.7].groupby([*columns, "task", "seed"])["steps"].min() / 1e6
-    others = {"lambda 0.9": "lam=0.9", "desired KL 0.01": "desired_kl=0.01"}
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 6 and data[columns].drop_duplicates().shape[0] == 16
+    assert len(rows) == 6 and data[columns].drop_duplicates().shape[0] == 30
     for size, batches, epochs, *cells, _ in rows:
-        shape, _, other = size.partition(", ")
-        setting = (*map(int, shape.split(" x ")), int(batches), int(epochs), others.get(other, ""))
+        shape, *others = (
+            size.replace("lambda ", "lam=")
+            .replace("gamma ", "gamma=")
+            .replace("desired KL ", "desired_kl=")
+            .split(", ")
+        )
+        setting = (*map(int, shape.split(" x ")), int(batches), int(epochs), " ".join(others))
         for task, cell in zip(header[3:-1], cells, strict=True):
             steps = walking.loc[(*setting, task.strip("`"))]
             mean, latest = cell.partition(" (")[0].split(", ")
