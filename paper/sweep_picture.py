@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from legged_torque.paper.plotting import load_pyplot, save_figure
+from legged_torque.paper.report import check_extra
 from legged_torque.utils.cli import Parser, check_output
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import read_data
@@ -33,6 +34,7 @@ def plot_sweeps() -> None:
     parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
     args = parser.parse_args()
     check_output(args.out)
+    check_extra()
     pyplot = load_pyplot()
     sweeps = [read_data(file, {"task", "sweep"}, "evaluate.py --sweep") for file in args.files]
     lines: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
@@ -56,21 +58,19 @@ def plot_sweeps() -> None:
 
 def _draw(axis: Axes, sweeps: list[dict[str, Any]], label: str, colour: str) -> None:
     """Draw tracking, or the share that falls after a push, in the middle of each part; a delay is a whole number."""
-    sweep, parts = sweeps[0], sweeps[0]["parts"]
-    is_push, is_whole = "fell" in parts[0], sweep["parameter"].endswith("_delay")
-    x = [part["from"] if is_whole else (part["from"] + part["to"]) / 2.0 for part in parts]
-    shown = (lambda part: part["fell"]) if is_push else lambda part: part["metrics"]["track_percentage"]
-    rows = [[shown(part) for part in each["parts"]] for each in sweeps]
-    means = np.array([[each["mean"] for each in row] for row in rows], float)
+    from legged_torque.paper.report.experiment import read_sweep  # needs the extra plots
+
+    sweep, tables = sweeps[0], [read_sweep(each) for each in sweeps]
+    x, means = tables[0]["at"], np.array([table["value"] for table in tables])
     mean, count = means.mean(axis=0), len(sweeps)
     if count == 1:
-        half = 1.96 * np.array([each["standard_error"] for each in rows[0]], float)
+        half = 1.96 * tables[0]["standard_error"]
     else:
         half = student(count) * means.std(axis=0, ddof=1) / math.sqrt(count)
     axis.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
     axis.plot(x, mean, color=colour, marker=".", label=label)
     axis.set(ylim=(0.0, 1.0), xlabel=f"{sweep['parameter']} [{sweep['unit']}]" if sweep["unit"] else sweep["parameter"])
-    axis.set_ylabel("share that falls" if is_push else "tracking")
+    axis.set_ylabel("share that falls" if tables[0]["is_push"].iloc[0] else "tracking")
 
 
 def student(count: int) -> float:

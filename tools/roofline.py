@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from legged_torque.benchmark.measure import WARM_UP, build, seconds_per_call, time_iterations, time_physics
 from legged_torque.envs import task_registry
-from legged_torque.learning.ppo import OnDevicePPO
+from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.sim.engine import Engine
 from legged_torque.sim.fused.model import unread_columns
 from legged_torque.utils import cli
@@ -63,7 +63,7 @@ def measure_peaks(device: str, dtype: str) -> Peaks:
     return Peaks(2 * size**3 / product, 2 * count / copy)
 
 
-def work(alg: OnDevicePPO, sim: Engine, decimation: int) -> dict[str, Any]:
+def work(alg: TorchPPO, sim: Engine, decimation: int) -> dict[str, Any]:
     """Return what an update and the physics of a control step need: "update_flop", "update_bytes", "physics_bytes".
 
     "update_dtype" is the kind of numbers that an update multiplies.
@@ -85,7 +85,7 @@ def shares(row: dict[str, Any], peaks: Peaks) -> dict[str, float]:
     return rates
 
 
-def update_flop(alg: OnDevicePPO) -> int:
+def update_flop(alg: TorchPPO) -> int:
     """Return the operations of an update's matrix products; a multiplication with an addition is two."""
     passes = {alg.actor: actor_passes(alg), alg.critic: images(alg)}
     return samples(alg) * sum(count * flop_per_sample(model) for model, count in passes.items())
@@ -97,7 +97,7 @@ def flop_per_sample(model: nn.Module) -> int:
     return 2 * (2 * first + 3 * sum(others))
 
 
-def update_bytes(alg: OnDevicePPO) -> int:
+def update_bytes(alg: TorchPPO) -> int:
     """Return the bytes that an update reads and writes if it does so once, see above."""
     storage, width = alg.storage, alg.product_dtype.itemsize  # of activations, too
     groups = {*alg.actor.obs_groups, *alg.critic.obs_groups}
@@ -112,18 +112,18 @@ def update_bytes(alg: OnDevicePPO) -> int:
     return samples(alg) * per_sample + alg.num_learning_epochs * alg.num_mini_batches * per_minibatch
 
 
-def samples(alg: OnDevicePPO) -> int:
+def samples(alg: TorchPPO) -> int:
     """Return the samples of all minibatches of an update, without mirror images."""
     rollout = alg.storage.num_envs * alg.storage.num_transitions_per_env
     return alg.num_learning_epochs * (rollout // alg.num_mini_batches) * alg.num_mini_batches
 
 
-def images(alg: OnDevicePPO) -> int:
+def images(alg: TorchPPO) -> int:
     """Return how often each sample counts in a minibatch: twice with its mirror image."""
     return 2 if alg.symmetry and alg.symmetry.use_data_augmentation else 1
 
 
-def actor_passes(alg: OnDevicePPO) -> int:
+def actor_passes(alg: TorchPPO) -> int:
     """Return how often the actor sees each sample; the mirror loss shows it the sample and its image once more."""
     return images(alg) + (2 if alg.symmetry and alg.symmetry.use_mirror_loss else 0)
 
@@ -166,7 +166,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         task, runner = build(args.task, (env_cfg, train_cfg), device, folder)
         alg = runner.alg
-        if not isinstance(alg, OnDevicePPO):
+        if not isinstance(alg, TorchPPO):
             raise UserError(f"updates of PPO are counted, not those of {type(alg).__name__}")
         time_iterations(runner, WARM_UP)
         row: dict[str, Any] = {"update_ms": median(time_iterations(runner, args.rounds)["update"])}

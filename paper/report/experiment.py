@@ -214,25 +214,33 @@ def read_result(training: Training, file: Path) -> None:
             tiles[name] = [estimate["mean"] for estimate in estimates]
         training.crossings = tiles.astype({"kind": str, "level": float, **dict.fromkeys(MEASURES, float)})
         return
+    training.devices.add(str(values.get("device")))
     if "sweep" in values:
         training.sweeps[values["sweep"]["parameter"]] = read_sweep(values["sweep"])
         return
     means = {name: estimate.get("mean") for name, estimate in values["metrics"].items()}
     if file.stem.startswith("condition_"):
-        training.conditions[file.stem.removeprefix("condition_")] = float(means["track_percentage"])
+        training.conditions[file.stem.removeprefix("condition_")] = float(np.asarray(means["track_percentage"], float))
         return
     row = pd.DataFrame([{"steps": int(values["steps"]), **means}]).reindex(columns=COLUMNS).astype(float)
     environment = file.stem.removeprefix("result_")
     before = training.results.get(environment)
     if before is None or row["steps"].iloc[0] >= before["steps"].iloc[0]:
         training.results[environment] = row.replace([np.inf, -np.inf], np.nan)
-    training.devices.add(str(values.get("device")))
 
 
 def read_sweep(sweep: dict[str, Any]) -> pd.DataFrame:
-    """Return the parts of a sweep: at, value, unit, and is_push; see :mod:`~legged_torque.paper.report.robustness`."""
+    """Return the parts of a sweep.
+
+    Returns:
+        ``at``: the middle of the part, or a delay, which is a whole number; ``value``: tracking or, if ``is_push``, the
+        share of robots that fell after a push; ``standard_error`` over worlds, if it is there; ``unit`` of ``at``.
+    """
     parts, is_delay = sweep["parts"], sweep["parameter"].endswith("_delay")
     at = [part["from"] if is_delay else (part["from"] + part["to"]) / 2.0 for part in parts]
     values = [part["fell"] if "fell" in part else part["metrics"]["track_percentage"] for part in parts]
-    table = pd.DataFrame({"at": at, "value": [value["mean"] for value in values]}, dtype=float)
+    errors = [value.get("standard_error") for value in values]
+    table = pd.DataFrame(
+        {"at": at, "value": [value["mean"] for value in values], "standard_error": errors}, dtype=float
+    )
     return table.assign(unit=sweep["unit"], is_push="fell" in parts[0])

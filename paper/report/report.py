@@ -22,7 +22,7 @@ from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.figures_curves import FEW
-from legged_torque.paper.report.robustness import condition_table, findings, sweep_figures, sweep_title
+from legged_torque.paper.report.robustness import condition_table, find_sweeps, findings, sweep_figures
 from legged_torque.paper.report.style import in_words, method, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
@@ -50,7 +50,8 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
     table = summarize(experiment, from_step)
     differences, configs = tables.find_differences(experiment, table), first_configs(experiment)
     planned, rough = planned_figures(experiment, table, differences), rough_figures(experiment)
-    drawn = draw_all(experiment, planned | rough | sweep_figures(experiment), out)
+    sweeps = find_sweeps(experiment)
+    drawn = draw_all(experiment, planned | rough | sweep_figures(experiment, sweeps), out)
     signs = {name: int((table["sign"] == sign).sum()) for sign, name in CLASSES.items()}
     values = {
         "title": f"Results of {experiment.folder.resolve().name}",
@@ -68,11 +69,7 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         "absent_figures": [title for title in planned if title not in drawn],
         "rough_figures": [title for title in rough if title in drawn],
         "conditions": {name: condition_table(experiment, name) for name in experiment.plan.environments},
-        "sweeps": [
-            (title, findings(experiment, name, environment))
-            for environment, name in product(experiment.plan.environments, experiment.plan.sweeps)
-            if (title := sweep_title(name, environment)) in drawn
-        ],
+        "sweeps": {title: findings(experiment.plan.tasks, sweep) for title, sweep in sweeps.items()},
         "setup": setup_lines(experiment),
         "plan": (experiment.folder / SETTINGS_FILE).read_text("utf-8", "replace") if experiment.is_planned else "",
         "folders": [portable_path(experiment.folder), portable_path(out)],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -17,118 +18,136 @@ from legged_torque.paper.report.tables import SIGNIFICANT, Rows, baseline_of, es
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+VALUES = ["task", "seed", "at", "value"]
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What a sweep found in the trainings of an environment.
+
+    Attributes:
+        parameter: Its name, with the unit in brackets.
+        is_push: Whether values are shares of robots that fell after a push; else they are tracking.
+        values: A row per task, seed and part, with the columns :data:`VALUES`.
+        compared: What :func:`compare` says of them.
+    """
+
+    parameter: str
+    is_push: bool
+    values: pd.DataFrame
+    compared: pd.DataFrame
+
 
 def condition_table(experiment: Experiment, environment: str) -> Rows:
-    """Return tracking in each condition, with what :func:`compare` says of its difference; nothing without data."""
-    rows = [
-        {"task": run.cell.task, "seed": run.cell.seed, "at": name, "value": value}
-        for run in experiment.runs
-        for name, value in run.conditions.items()
-        if run.cell.environment == environment
-    ]
-    if not rows:
+    """Return tracking in each condition, bold where it differs from the baseline; nothing without data."""
+    runs = [run for run in experiment.runs if run.cell.environment == environment]
+    rows = [(run.cell.task, run.cell.seed, *item) for run in runs for item in run.conditions.items()]
+    values = pd.DataFrame(rows, columns=VALUES).dropna()
+    if values.empty:
         return []
-    values = pd.DataFrame(rows)
-    names = [name for name in experiment.plan.conditions if name in set(values["at"])]
-    compared = pd.concat([compare(experiment, part) for _, part in values.groupby("at")])
-    planned, table = len(experiment.plan.seeds), [["method", *names]]
+    apart = [compare(experiment.plan.tasks, part) for _, part in values.groupby("at")]  # a family of tests each
+    significant = {key for found in apart for key in found[found["is_significant"]].index}
+    seeds = values.groupby(["task", "at"])["value"].agg(list)
+    names, planned = (
+        [name for name in experiment.plan.conditions if name in set(values["at"])],
+        len(experiment.plan.seeds),
+    )
+    table = [["method", *names]]
     for task in experiment.plan.tasks:
-        cells = []
-        for name in names:
-            seeds = values.query("task == @task and at == @name")["value"].tolist()
-            is_significant = (task, name) in compared.index and compared.loc[(task, name), "is_significant"]
-            cells.append(estimate_text(estimate(seeds) | {"is_significant": is_significant}, ".3f", planned))
-        table.append([method(task), *cells])
+        found = [
+            estimate(seeds.get((task, name), [])) | {"is_significant": (task, name) in significant} for name in names
+        ]
+        table.append([method(task), *(estimate_text(cell, ".3f", planned) for cell in found)])
     return table
 
 
-def sweep_values(experiment: Experiment, environment: str, name: str) -> pd.DataFrame:
-    """Return what a sweep found: a row per task, seed and part, with the columns ``at`` and ``value``.
+def find_sweeps(experiment: Experiment) -> dict[str, Sweep]:
+    """Return the sweeps for which there are data, by the titles of their figures."""
+    found = {}
+    for environment in experiment.plan.environments:
+        for name in experiment.plan.sweeps:
+            runs = [run for run in experiment.runs if run.cell.environment == environment and name in run.sweeps]
+            if runs:
+                parts = [run.sweeps[name].assign(task=run.cell.task, seed=run.cell.seed) for run in runs]
+                values, unit = (
+                    pd.concat(parts, ignore_index=True)[[*VALUES, "unit", "is_push"]],
+                    parts[0]["unit"].iloc[0],
+                )
+                where = f" trained in {in_words(environment)}" if len(experiment.plan.environments) > 1 else ""
+                compared = compare(experiment.plan.tasks, values)
+                parameter = f"{name} [{unit}]" if unit else name
+                found[f"Sweep of {name}{where}"] = Sweep(parameter, bool(values["is_push"].iloc[0]), values, compared)
+    return found
 
-    A delay is a whole number, other parameters are in the middle of their part. The value is tracking, or the share of
-    robots that fell after a push.
-    """
-    parts = [
-        run.sweeps[name].assign(task=run.cell.task, seed=run.cell.seed)
-        for run in experiment.runs
-        if run.cell.environment == environment and name in run.sweeps
-    ]
-    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
-
-def compare(experiment: Experiment, values: pd.DataFrame) -> pd.DataFrame:
+def compare(tasks: list[str], values: pd.DataFrame) -> pd.DataFrame:
     """Return by how much tasks differ from the baseline, in each part of a sweep or in a condition.
 
     Returns:
-        A row per task but the baseline and part (the index), with what :func:`estimate` returns and
+        A row per task but the baseline and part (the index) that both have, with what :func:`estimate` returns and
         ``is_significant``: by Welch's test, with Holm's correction over all rows.
     """
-    baseline = baseline_of(experiment.plan.tasks)
-    of = {key: seeds.dropna().tolist() for key, seeds in values.groupby(["task", "at"])["value"]}
+    baseline = baseline_of(tasks)
+    of = {key: seeds.tolist() for key, seeds in values.dropna(subset="value").groupby(["task", "at"])["value"]}
     keys = [key for key in of if key[0] != baseline and (baseline, key[1]) in of]
     rows = [estimate(of[key], of[baseline, key[1]]) for key in keys]
+    index = pd.MultiIndex.from_arrays([[key[0] for key in keys], [key[1] for key in keys]], names=["task", "at"])
     p_values = holm([welch(of[key], of[baseline, key[1]]) for key in keys])
-    index = pd.MultiIndex.from_tuples(keys, names=["task", "at"]) if keys else None
-    return pd.DataFrame(rows, index).assign(is_significant=p_values < SIGNIFICANT)
+    columns = ["values", "iqm", "low", "high", "seeds"]
+    return pd.DataFrame(rows, index, columns).assign(is_significant=p_values < SIGNIFICANT)
 
 
-def sweep_figures(experiment: Experiment) -> dict[str, Draw]:
+def sweep_figures(experiment: Experiment, sweeps: dict[str, Sweep]) -> dict[str, Draw]:
     """Return the functions that draw the figures of sweeps, by title."""
-    places = [(name, environment) for environment in experiment.plan.environments for name in experiment.plan.sweeps]
-    return {sweep_title(*place): partial(draw_sweep, experiment, *place) for place in places}
+    return {title: partial(draw_sweep, experiment.plan.tasks, sweep) for title, sweep in sweeps.items()}
 
 
-def sweep_title(name: str, environment: str) -> str:
-    """Return the title of the figure of a sweep."""
-    return f"Sweep of {name} in {in_words(environment)}"
-
-
-def draw_sweep(experiment: Experiment, name: str, environment: str) -> Figure | None:
-    """Draw a line per task, and beside it the differences to the baseline; return None without data.
+def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
+    """Draw a line per task, and beside it the differences to the baseline.
 
     Bars are 95% bootstrap intervals over seeds. A filled point is a significant difference.
     """
-    values, tasks = sweep_values(experiment, environment, name), experiment.plan.tasks
-    if values.empty:
-        return None
     figure, (left, right) = load_pyplot().subplots(1, 2, figsize=(12.0, 4.6), layout="constrained")
-    for task in tasks:
-        own = values[values["task"] == task].groupby("at")["value"].agg(lambda seeds: estimate(seeds.dropna().tolist()))
-        found, (color, line, _) = pd.DataFrame(own.tolist(), own.index), style(tasks, task)
-        if len(found):
-            left.plot(found["iqm"], color=color, linestyle=line, marker=".", label=name_of(task))
-            left.vlines(found.index, found["low"], found["high"], color=color, linewidth=1.0)
-    compared, width = compare(experiment, values), np.ptp(values["at"]) / max(values["at"].nunique() - 1, 1)
-    others = [task for task in tasks if len(compared) and task in compared.index]
+    seeds = sweep.values.dropna(subset="value").groupby(["task", "at"])["value"].agg(list)
+    for task in (task for task in tasks if task in seeds.index):
+        found, (color, line, _) = (
+            pd.DataFrame({at: estimate(own) for at, own in seeds[task].items()}).T,
+            style(tasks, task),
+        )
+        left.plot(found["iqm"], color=color, linestyle=line, marker=".", label=name_of(task))
+        left.vlines(found.index, found["low"], found["high"], color=color, linewidth=1.0)
+    places = np.unique(sweep.values["at"])
+    width, others = np.ptp(places) / max(len(places) - 1, 1), [task for task in tasks if task in sweep.compared.index]
     for place, task in enumerate(others):
-        cells, color = compared.loc[task], style(tasks, task)[0]
+        cells, color = sweep.compared.loc[task], style(tasks, task)[0]
         at = cells.index + 0.6 * width * ((place + 0.5) / len(others) - 0.5)  # side by side
         right.vlines(at, cells["low"], cells["high"], color=color)
         faces = np.where(cells["is_significant"], color, "white")
         right.scatter(at, cells["iqm"], c=faces, edgecolors=color, s=22, zorder=5)
     right.axhline(0.0, color="black", linewidth=1.0)
-    unit, is_push = values["unit"].iloc[0], values["is_push"].iloc[0]
     for axis in (left, right):
-        axis.set_xlabel(f"{name} [{unit}]" if unit else name)
+        axis.set_xlabel(sweep.parameter)
         axis.grid(alpha=0.3)
-    left.set(ylabel="share that falls" if is_push else "tracking", ylim=(0.0, 1.0))
+    left.set(ylabel="share that falls" if sweep.is_push else "tracking", ylim=(0.0, 1.0))
     right.set_ylabel(f"minus {name_of(baseline_of(tasks))}")
     figure.legend(loc="outside lower center", ncols=4, handlelength=3, frameon=False)
     return figure
 
 
-def findings(experiment: Experiment, name: str, environment: str) -> str:
-    """Return in words which tasks a sweep separates from the baseline and where most, and which not; it has data."""
-    compared, apart, same = compare(experiment, values := sweep_values(experiment, environment, name)), [], []
-    for task in experiment.plan.tasks:
-        cells = compared.loc[task] if len(compared) and task in compared.index else compared[:0]
-        significant, is_tested = cells[cells["is_significant"]], len(cells) and cells["seeds"].max() > 1
+def findings(tasks: list[str], sweep: Sweep) -> str:
+    """Return in words which tasks a sweep separates from the baseline and where most, which not, what is not tested."""
+    apart: list[str] = []
+    same: list[str] = []
+    untested: list[str] = []
+    for task in (task for task in tasks if task != baseline_of(tasks) and task in set(sweep.values["task"])):
+        cells = sweep.compared[sweep.compared.index.get_level_values("task") == task].droplevel("task")
+        significant = cells[cells["is_significant"]]
         if len(significant):
-            most = significant["iqm"].abs().idxmax()
-            at, cell = f"{most:.4g} {values['unit'].iloc[0]}".strip(), estimate_text(significant.loc[most], "+.3f")
-            apart.append(f"{method(task)} in {len(significant)} of {len(cells)} parts, most at {at}: {cell}")
-        elif is_tested:
-            same.append(method(task))
-    sentences = [f"Different from {method(baseline_of(experiment.plan.tasks))}: {'; '.join(apart)}."] if apart else []
+            most = significant["iqm"].astype(float).abs().idxmax()
+            cell = estimate_text(significant.loc[most], "+.3f")
+            apart.append(f"{method(task)} in {len(significant)} of {len(cells)} parts, most at {most:.4g}: {cell}")
+        else:
+            (same if cells["seeds"].max() > 1 else untested).append(method(task))
+    sentences = [f"Different from {method(baseline_of(tasks))}: {'; '.join(apart)}."] if apart else []
     sentences += [f"No significant difference: {', '.join(same)}."] if same else []
-    return " ".join(sentences) or "With one seed each, nothing is tested."
+    return " ".join(sentences + ([f"Two seeds or more are missing to test {', '.join(untested)}."] if untested else []))

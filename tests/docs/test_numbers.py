@@ -147,10 +147,11 @@ def test_rough_ground_with_latency():
         ["track_percentage", "falls_per_minute"]
     ]
     (pd_1, fell_1), (pd_2, fell_2), (one, fell_3), (two, fell_4) = late.mean().to_numpy()
-    said = f"tracks {one:.3f} and {two:.3f} after step 246 million, tuned PD {pd_1:.3f} and {pd_2:.3f}; they fall "
-    assert said + f"{fell_3:.2f} and {fell_4:.2f}, {fell_1:.2f} and {fell_2:.2f} times" in text_of(
-        "results.md", "- **With lat"
+    said = (
+        f"tracks {one:.3f} and {two:.3f} after step 246 million, tuned PD {pd_1:.3f} and {pd_2:.3f}; the recipe falls "
     )
+    said += f"{fell_3:.2f} and {fell_4:.2f} times a minute, PD {fell_1:.2f} and {fell_2:.2f} ("
+    assert said in text_of("results.md", "- **With latency**")
 
 
 def test_tuned_gains(table_one):

@@ -46,7 +46,7 @@ def test_it_learns_to_hold_point_masses():
         "flashsac.updates_per_step=2",
     )
     trainer = make("flashsac.critic.num_bins=51", *faster)
-    assert_holds_points(trainer)
+    assert_holds_points(trainer, within=0.3)
 
 
 def test_losses():

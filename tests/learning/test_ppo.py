@@ -320,7 +320,11 @@ def test_undone_first_update():
 
 
 def test_elu_on_a_cpu():
-    """It is torch's to a rounding error of 1, also of numbers that are not finite."""
-    values = torch.tensor([-math.inf, -200.0, -1.0, -1e-4, -1e-9, 0.0, 1e-9, 3.0, math.inf, math.nan])
-    found = run_network([nn.ELU()], values.clone())
-    torch.testing.assert_close(found, nn.functional.elu(values), rtol=0.0, atol=1.2e-7, equal_nan=True)
+    """It and its derivative are torch's to a rounding error of 1, also of numbers that are not finite."""
+    numbers, found = [-math.inf, -200.0, -1.0, -1e-4, -1e-9, 0.0, 1e-9, 3.0, math.inf, math.nan], []
+    for elu in (nn.functional.elu, lambda values: run_network([nn.ELU()], 1.0 * values)):
+        values = torch.tensor(numbers, requires_grad=True)
+        outputs = elu(values)
+        outputs.sum().backward()
+        found.append((outputs, values.grad))
+    torch.testing.assert_close(*found, rtol=0.0, atol=1.2e-7, equal_nan=True)

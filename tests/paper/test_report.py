@@ -182,12 +182,13 @@ def test_rough_ground(tmp_path):
 
 def test_conditions_and_sweeps(tmp_path):
     """Tracking by condition, a figure and a sentence per sweep; what differs is bold, what is missing is named."""
-    folder, tasks = tmp_path / "e", ["a1_position", "a1_torque"]
+    folder, tasks = tmp_path / "e", ["a1_position", "a1_torque", "a1_decap"]
     write_experiment(folder, {"low": ["low"]}, seeds=(1, 2, 3), tasks=tasks)
-    plan = {"sweeps": {"action_delay": {}, "push_velocity": {}}, "conditions": {"noise": {}, "dead_leg": {}}}
+    conditions = {"noise": {}, "dead_leg": {}, "a_drop": {}}
+    plan = {"sweeps": {"action_delay": {}, "push_velocity": {}}, "conditions": conditions}
     plan |= yaml.safe_load((folder / "experiment.yaml").read_text())
     (folder / "experiment.yaml").write_text(yaml.safe_dump(plan, sort_keys=False))
-    for task, seed in product(tasks, (1, 2, 3)):
+    for task, seed in [*product(tasks[:2], (1, 2, 3)), ("a1_decap", 1)]:
         cell, late = folder / f"{task}-low-s{seed}", 0.5 if task == "a1_torque" else 0.8
         write_part(cell / "2026-01-01_00-00-00", whole_run(0.7))
         tracking = [{"track_percentage": {"mean": mean + 0.01 * seed}} for mean in (0.8, late)]
@@ -195,17 +196,20 @@ def test_conditions_and_sweeps(tmp_path):
         parts = [{"from": float(i), "to": i + 1.0, "metrics": metrics} for i, metrics in enumerate(tracking)]
         sweep = {"parameter": "action_delay", "unit": "physics_steps", "parts": parts}
         (cell / "sweep_action_delay.json").write_text(json.dumps({"sweep": sweep}))
-    (cell / "condition_dead_leg.json").write_text("{}")
+        nothing = {"track_percentage": {"mean": None if seed == 1 else 0.6}}  # nothing was commanded with seed 1
+        (cell / ("push.json" if task == "a1_position" else "condition_a_drop.json")).write_text(
+            json.dumps({"steps": 1, "metrics": nothing})
+        )
+    (folder / "a1_torque-low-s3" / "condition_dead_leg.json").write_text("{}")
     assert run_script(folder, "--out", tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.md").read_text()
     table = text.partition("## Other conditions")[2]
-    assert "| method | noise |" in table and "| PD | 0.820 [0.810, 0.830] |" in table
-    assert "| Default torque | **0.520 [0.510, 0.530]** |" in table  # 0.3 less, standard error 0.008
-    assert "Different from PD: Default torque in 1 of 2 parts, most at 1 physics_steps: **-0.300 [" in table
-    assert (
-        "![Sweep of action_delay in low](sweepofaction_delayinlow.png)" in table and "push_velocity in low" not in table
-    )
-    assert "seed 2: not evaluated: sweep of push_velocity, condition dead_leg." in text
+    assert "| method | noise | a_drop |" in table and "| PD | 0.820 [0.810, 0.830] | – |" in table
+    assert "| Default torque | **0.520 [0.510, 0.530]** | 0.600 [0.600, 0.600] (2) |" in table  # standard error 0.008
+    assert "Different from PD: Default torque in 1 of 2 parts, most at 1: **-0.300 [" in table
+    assert "Two seeds or more are missing to test `a1_decap`." in table
+    assert "![Sweep of action_delay](sweepofaction_delay.png)" in table and "![Sweep of push_velocity" not in table
+    assert "`a1_torque` in low, seed 1: not evaluated: sweep of push_velocity, condition dead_leg." in text
     assert "'a1_torque-low-s3/condition_dead_leg.json' cannot be read; not evaluated: sweep of push" in text
 
 

@@ -34,7 +34,7 @@ class OnDevicePPO(TorchPPO):
 
 
 def has_kernels(alg: TorchPPO) -> bool:
-    """Return whether Triton's kernels and the code for CPUs know all parts of an algorithm; none of a user's."""
+    """Return whether Triton's kernels and :class:`CpuPPO` know all parts of an algorithm; they know no user's class."""
     models, symmetry = (alg.actor, alg.critic), alg.symmetry
     return (
         type(alg) is OnDevicePPO

@@ -67,7 +67,7 @@ def run_network(network: nn.Module, inputs: Tensor) -> Tensor:
 
 
 class _Elu(torch.autograd.Function):
-    """An ELU in place of its inputs by exp2, twice as fast as by the expm1 of torch."""
+    """An ELU in place of its inputs by exp2, which takes less time than the expm1 of torch."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
