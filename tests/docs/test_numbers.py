@@ -249,7 +249,7 @@ def test_few_worlds():
     columns = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
     walking = data[data["track_percentage"] >= 0.7].groupby([*columns, "task", "seed"])["steps"].min() / 1e6
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 6 and data[columns].drop_duplicates().shape[0] == 30
+    assert len(rows) == 5 and data[columns].drop_duplicates().shape[0] == 30
     for size, batches, epochs, *cells, _ in rows:
         shape, *others = (
             size.replace("lambda ", "lam=")
