@@ -38,12 +38,12 @@ LINES = {
     "legged_torque/utils": 3266,
     "legged_torque/viewer": 2487,
     "scripts": 2011,
-    "paper": 3224,
+    "paper": 3216,
     "tools": 1232,
     "tests": 24_056,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 31_998  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_990  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -48,16 +48,12 @@ def condition_table(experiment: Experiment, environment: str) -> Rows:
     apart = [compare(experiment.plan.tasks, part) for _, part in values.groupby("at")]  # a family of tests each
     significant = {key for found in apart for key in found[found["is_significant"]].index}
     seeds = values.groupby(["task", "at"])["value"].agg(list)
-    names, planned = (
-        [name for name in experiment.plan.conditions if name in set(values["at"])],
-        len(experiment.plan.seeds),
-    )
+    names = [name for name in experiment.plan.conditions if name in set(values["at"])]
     table = [["method", *names]]
     for task in experiment.plan.tasks:
-        found = [
-            estimate(seeds.get((task, name), [])) | {"is_significant": (task, name) in significant} for name in names
-        ]
-        table.append([method(task), *(estimate_text(cell, ".3f", planned) for cell in found)])
+        keys = [(task, name) for name in names]
+        found = [estimate(seeds.get(key, [])) | {"is_significant": key in significant} for key in keys]
+        table.append([method(task), *(estimate_text(cell, ".3f", len(experiment.plan.seeds)) for cell in found)])
     return table
 
 
@@ -69,10 +65,7 @@ def find_sweeps(experiment: Experiment) -> dict[str, Sweep]:
             runs = [run for run in experiment.runs if run.cell.environment == environment and name in run.sweeps]
             if runs:
                 parts = [run.sweeps[name].assign(task=run.cell.task, seed=run.cell.seed) for run in runs]
-                values, unit = (
-                    pd.concat(parts, ignore_index=True)[[*VALUES, "unit", "is_push"]],
-                    parts[0]["unit"].iloc[0],
-                )
+                values, unit = pd.concat(parts, ignore_index=True), parts[0]["unit"].iloc[0]
                 where = f" trained in {in_words(environment)}" if len(experiment.plan.environments) > 1 else ""
                 compared = compare(experiment.plan.tasks, values)
                 parameter = f"{name} [{unit}]" if unit else name
@@ -110,10 +103,8 @@ def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
     figure, (left, right) = load_pyplot().subplots(1, 2, figsize=(12.0, 4.6), layout="constrained")
     seeds = sweep.values.dropna(subset="value").groupby(["task", "at"])["value"].agg(list)
     for task in (task for task in tasks if task in seeds.index):
-        found, (color, line, _) = (
-            pd.DataFrame({at: estimate(own) for at, own in seeds[task].items()}).T,
-            style(tasks, task),
-        )
+        found = pd.DataFrame({at: estimate(own) for at, own in seeds[task].items()}).T
+        color, line, _ = style(tasks, task)
         left.plot(found["iqm"], color=color, linestyle=line, marker=".", label=name_of(task))
         left.vlines(found.index, found["low"], found["high"], color=color, linewidth=1.0)
     places = np.unique(sweep.values["at"])
@@ -136,9 +127,8 @@ def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
 
 def findings(tasks: list[str], sweep: Sweep) -> str:
     """Return in words which tasks a sweep separates from the baseline and where most, which not, what is not tested."""
-    apart: list[str] = []
-    same: list[str] = []
-    untested: list[str] = []
+    lists: list[list[str]] = [[], [], []]
+    apart, same, untested = lists
     for task in (task for task in tasks if task != baseline_of(tasks) and task in set(sweep.values["task"])):
         cells = sweep.compared[sweep.compared.index.get_level_values("task") == task].droplevel("task")
         significant = cells[cells["is_significant"]]
@@ -150,4 +140,6 @@ def findings(tasks: list[str], sweep: Sweep) -> str:
             (same if cells["seeds"].max() > 1 else untested).append(method(task))
     sentences = [f"Different from {method(baseline_of(tasks))}: {'; '.join(apart)}."] if apart else []
     sentences += [f"No significant difference: {', '.join(same)}."] if same else []
-    return " ".join(sentences + ([f"Two seeds or more are missing to test {', '.join(untested)}."] if untested else []))
+    return " ".join(
+        sentences + ([f"Not tested, for want of two seeds each: {', '.join(untested)}."] if untested else [])
+    )

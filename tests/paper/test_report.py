@@ -207,7 +207,7 @@ def test_conditions_and_sweeps(tmp_path):
     assert "| method | noise | a_drop |" in table and "| PD | 0.820 [0.810, 0.830] | – |" in table
     assert "| Default torque | **0.520 [0.510, 0.530]** | 0.600 [0.600, 0.600] (2) |" in table  # standard error 0.008
     assert "Different from PD: Default torque in 1 of 2 parts, most at 1: **-0.300 [" in table
-    assert "Two seeds or more are missing to test `a1_decap`." in table
+    assert "Not tested, for want of two seeds each: `a1_decap`." in table
     assert "![Sweep of action_delay](sweepofaction_delay.png)" in table and "![Sweep of push_velocity" not in table
     assert "`a1_torque` in low, seed 1: not evaluated: sweep of push_velocity, condition dead_leg." in text
     assert "'a1_torque-low-s3/condition_dead_leg.json' cannot be read; not evaluated: sweep of push" in text
