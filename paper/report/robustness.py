@@ -28,7 +28,7 @@ class Sweep:
     Attributes:
         parameter: Its name, with the unit in brackets.
         is_push: Whether values are shares of robots that fell after a push; else they are tracking.
-        values: A row per task, seed and part, with the columns :data:`VALUES`.
+        values: A row per task, seed and part, with at least the columns :data:`VALUES`.
         compared: What :func:`compare` says of them.
     """
 
@@ -127,8 +127,9 @@ def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
 
 def findings(tasks: list[str], sweep: Sweep) -> str:
     """Return in words which tasks a sweep separates from the baseline and where most, which not, what is not tested."""
-    lists: list[list[str]] = [[], [], []]
-    apart, same, untested = lists
+    apart: list[str] = []
+    same: list[str] = []
+    untested: list[str] = []
     for task in (task for task in tasks if task != baseline_of(tasks) and task in set(sweep.values["task"])):
         cells = sweep.compared[sweep.compared.index.get_level_values("task") == task].droplevel("task")
         significant = cells[cells["is_significant"]]
@@ -140,6 +141,5 @@ def findings(tasks: list[str], sweep: Sweep) -> str:
             (same if cells["seeds"].max() > 1 else untested).append(method(task))
     sentences = [f"Different from {method(baseline_of(tasks))}: {'; '.join(apart)}."] if apart else []
     sentences += [f"No significant difference: {', '.join(same)}."] if same else []
-    return " ".join(
-        sentences + ([f"Not tested, for want of two seeds each: {', '.join(untested)}."] if untested else [])
-    )
+    sentences += [f"Not tested, for want of two seeds each: {', '.join(untested)}."] if untested else []
+    return " ".join(sentences)
