@@ -12,9 +12,11 @@ from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, al
 
 SAMPLES = 128  # of a tile of a matrix product
 TILE = 128  # columns of it
+NARROW_TILE = 64  # of gradients of what layers read, and of layers that are no wider
+LOSS_SAMPLES = 16  # of a program that computes losses; with 128 it takes 2.5 times as long
 NUMBERS = 4  # that follow the gradients: value loss, surrogate loss, entropy, KL divergence
 SAMPLES_PER_PART = 1024  # of which gradients of weights are summed up by one program, if there are not too many
-MAX_PARTS = 16  # a power of two
+MAX_PARTS = 6  # with the default networks, an H100 computes all tiles of so many parts at once
 
 
 class Memory:
@@ -28,15 +30,19 @@ class Memory:
         actor_size: Number of the actor's parameters.
         weights: Weights in the products' precision, each layer's with zeros up to aligned sizes. Shape: (numbers,).
         source: Where in ``weights`` each parameter is, -1 for others than weights. Shape: (parameters,), int32.
-        destination: Which parameter's gradient each column of ``sums`` belongs to, -1 for none; the first ones are
+        loss_destination: Which gradient each column of ``loss_sums`` belongs to, -1 for none; the first ones are
             numbers that stand behind all gradients. Shape: (columns,), int32.
+        destination: The same for ``sums``.
         rows: Samples of a minibatch, up to whole tiles.
         values: Inputs, and what all layers have computed. Shape: (numbers,).
         outputs: Outputs of the actor, then of the critic, in float32. Shape: (rows, outputs).
         gradients: Gradients of the loss by the values, except for the inputs. Shape: (numbers,).
         partial: Room for gradients of weights from each part of the samples. Shape: (parts, numbers).
-        sums: Room for sums over the samples of a tile: numbers, then gradients. Shape: (tiles, columns).
-        forward: A table for each stage, whose layers do not depend on each other, and whether it has outputs.
+        loss_sums: Room for sums over a few samples: numbers, then gradients by deviations and outputs.
+            Shape: (rows / LOSS_SAMPLES, columns).
+        sums: Room for sums over the samples of a tile: gradients by what layers read. Shape: (tiles, columns).
+        forward: For each stage, whose layers do not depend on each other, a table, the tiles' columns, and whether
+            it has outputs.
         backward: A table for each stage of gradients of what layers read.
         weight_tiles: The table for gradients of weights.
     """
@@ -82,11 +88,9 @@ class Memory:
         first_input = min(map(self.place, self.inputs))  # which stand behind all else
         self.gradients = self.weights.new_zeros(first_input + TILE)
         self.partial = torch.zeros(parts, room, device=device)
+        self.loss_sums = torch.zeros(self.rows // LOSS_SAMPLES, len(self.loss_destination), device=device)
         self.sums = torch.zeros(self.rows // SAMPLES, len(self.destination), device=device)
-        self.forward = [
-            (self._table(map(self._forward_tiles, stage)), any(layer.first_output is not None for layer in stage))
-            for stage in stages(networks)
-        ]
+        self.forward = [self._forward_table(stage) for stage in stages(networks)]
         self.backward = self._backward_tables()
         self.weight_tiles = self._table(map(self._weight_tiles, self._layers))
 
@@ -100,24 +104,23 @@ class Memory:
         return self._places[columns.block] + columns.start
 
     def output_places(self) -> Tensor:
-        """Return where the gradient by each output of the networks begins, its stride and its column of ``sums``.
+        """Return where the gradient by each output of the networks begins, and its stride.
 
-        Shape: (3, outputs), int64.
+        Shape: (2, outputs), int64.
         """
-        places = []
-        for target in self._outputs:
-            first, column = self.place(target), self._sum_columns[target]
-            places += [(first + i, target.block.width, column + i) for i in range(target.size)]
+        places = [(self.place(to) + i, to.block.width) for to in self._outputs for i in range(to.size)]
         return torch.tensor(places, device=self.flat.device).T.contiguous()
 
     def _place_weights(self, std_parameter: nn.Parameter) -> int:
-        """Set ``source`` and ``destination``; return how many numbers weights take."""
+        """Set ``source`` and both destinations; return how many numbers weights take."""
         size, room = len(self.flat), 0
         source = torch.full((size,), -1, dtype=torch.int32)
         first = std_parameter.storage_offset()
-        destination = [*range(size, size + NUMBERS), *range(first, first + std_parameter.numel())]
+        of_losses = [*range(size, size + NUMBERS), *range(first, first + std_parameter.numel())]
+        destination: list[int] = []
         self._weight_places: dict[Layer, int] = {}
-        self._sum_columns: dict[Columns, int] = {}  # of gradients by what a layer writes
+        self._sum_columns: dict[Columns, int] = {}  # of gradients by what a layer writes and another one reads
+        read = {source for layer in self._layers for source in layer.sources}
         for layer in self._layers:
             linear: Any = layer.linear
             height = aligned(linear.out_features)
@@ -127,23 +130,35 @@ class Memory:
             source[first : first + index.numel()] = index.flatten().to(source.dtype)
             self._weight_places[layer] = room
             room += height * layer.input_width
-            self._sum_columns[layer.target] = len(destination)
             first = linear.bias.storage_offset()
-            destination += [*range(first, first + linear.out_features), *[-1] * (height - linear.out_features)]
+            biases = [*range(first, first + linear.out_features)]
+            if layer.target in read:
+                self._sum_columns[layer.target] = len(destination)
+                destination += [*biases, *[-1] * (height - len(biases))]
+            if layer.first_output is not None:
+                of_losses += [-1] * len(biases) if layer.target in read else biases
         self.source = source.to(self.flat.device)
-        self.destination = torch.tensor(destination, dtype=torch.int32, device=self.flat.device)
+        self.loss_destination, self.destination = (
+            torch.tensor(columns, dtype=torch.int32, device=self.flat.device) for columns in (of_losses, destination)
+        )
         return room
 
     def _table(self, tiles: Iterable[list[list[int]]]) -> Tensor:
         """Return the tiles of several layers as a table on the device."""
         return torch.tensor([*chain.from_iterable(tiles)], dtype=torch.int64, device=self.flat.device)
 
-    def _forward_tiles(self, layer: Layer) -> list[list[int]]:
+    def _forward_table(self, stage: Sequence[Layer]) -> tuple[Tensor, int, bool]:
+        """Return an entry of ``forward``."""
+        tile = TILE if any(layer.target.size > NARROW_TILE for layer in stage) else NARROW_TILE
+        has_outputs = any(layer.first_output is not None for layer in stage)
+        return self._table(self._forward_tiles(layer, tile) for layer in stage), tile, has_outputs
+
+    def _forward_tiles(self, layer: Layer, tile: int) -> list[list[int]]:
         """Return the tiles of a layer for the kernel ``forward``."""
         tiles = []
         source, target, weights = layer.sources[0], layer.target, self._weight_places[layer]
         bias = int(layer.linear.bias.storage_offset())
-        for first in range(0, aligned(target.size), TILE):
+        for first in range(0, aligned(target.size), tile):
             output = -1 if layer.first_output is None else layer.first_output + first
             read = [self.place(source), source.block.width, layer.input_width]
             read += [weights + first * layer.input_width, layer.input_width]
@@ -163,7 +178,7 @@ class Memory:
             for layer in stage:
                 offset = 0
                 for source in layer.sources:
-                    for first in range(0, aligned(source.size), TILE):
+                    for first in range(0, aligned(source.size), NARROW_TILE):
                         read = [self.place(layer.target), layer.target.block.width, aligned(layer.target.size)]
                         read += [self._weight_places[layer] + offset + first, layer.input_width]
                         sizes = [aligned(source.size) - first, self._sum_columns[source] + first]

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 
 ROWS = 16  # samples of a program that writes what it reads
-NUMBERS = 4096  # that it reads at most, where a sample has not more
+NUMBERS = 1024  # that it reads at most, where a sample has not more
 
 
 @triton.jit
@@ -101,14 +101,14 @@ def squared_error(value, first, target, clip, CLIP_VALUES: tl.constexpr):
 @triton.jit
 def losses(
     outputs, std_parameter, low, high, old_std, indices, order, signs, actions, means, log_probs, values, advantages,
-    returns, actor_learns, gradients, places, strides, sums, sums_stride, sum_columns, num_chosen, num_samples, size,
+    returns, actor_learns, gradients, places, strides, sums, sums_stride, num_chosen, num_samples, size,
     clip, value_weight, entropy_weight, IS_LOG: tl.constexpr, CLIP_VALUES: tl.constexpr, ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of the losses by the outputs of the networks, and each program's sums of the losses.
 
     Sums: value loss, surrogate loss, entropy, KL divergence of the samples that are no mirror images, then the
-    gradients by the parameters of the standard deviations; gradients by each output, in their ``sum_columns``.
+    gradients by the parameters of the standard deviations, and by each output.
     ``places`` and ``strides``: where the gradient by each output belongs.
     """
     samples = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
@@ -163,8 +163,8 @@ def losses(
     tl.store(out + 2, entropy)
     tl.store(out + 3, kl / num_chosen)
     tl.store(out + 4 + columns, by_std, mask=is_action)
-    tl.store(out + tl.load(sum_columns + columns, mask=is_action, other=0), tl.sum(by_mean, 0), mask=is_action)
-    tl.store(out + tl.load(sum_columns + size), tl.sum(by_value))
+    tl.store(out + 4 + size + columns, tl.sum(by_mean, 0), mask=is_action)
+    tl.store(out + 4 + 2 * size, tl.sum(by_value))
 
 
 @triton.jit

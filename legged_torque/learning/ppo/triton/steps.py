@@ -5,6 +5,7 @@ import triton.language as tl
 
 BLOCK = 1024  # parameters of a program
 PARTS = 64  # programs that sum up squares
+ROWS, COLUMNS = 512, 8  # of sums that a program adds at a time
 
 
 @triton.jit

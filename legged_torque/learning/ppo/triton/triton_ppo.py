@@ -15,7 +15,7 @@ from torch import Tensor
 
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.learning.ppo.triton import products, samples, steps
-from legged_torque.learning.ppo.triton.memory import NUMBERS, SAMPLES, TILE, Memory
+from legged_torque.learning.ppo.triton.memory import LOSS_SAMPLES, NARROW_TILE, NUMBERS, SAMPLES, TILE, Memory
 from legged_torque.learning.ppo.triton.networks import ALIGNMENT, Columns, aligned, read_network
 from legged_torque.sim.compiled import keep_kernels
 from legged_torque.utils import distributed
@@ -136,7 +136,7 @@ class TritonPPO(TorchPPO):
         self._write_losses()
         for table in memory.backward:
             arguments = (memory.values, memory.gradients, memory.weights, memory.sums, memory.sums.shape[1], table)
-            settings = {"SAMPLES": SAMPLES} | products.BACKWARD
+            settings = {"SAMPLES": SAMPLES, "TILE": NARROW_TILE} | products.BACKWARD
             self._product(products.input_gradient, arguments, memory.rows // SAMPLES, settings)
         self._weight_gradients()
         if self.is_multi_gpu:
@@ -192,22 +192,23 @@ class TritonPPO(TorchPPO):
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
             samples.observe[(num_rows // rows,)](
                 group, self.indices, order, signs, memory.values, *target, *counts,
-                CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns,
+                CHOOSE=bool(maps), ROWS=rows, COLUMNS=columns, num_warps=8,
             )  # fmt: skip
             column += group.shape[1]
 
     def _forward(self, num_rows: int) -> None:
         """Compute the outputs of actor and critic from their inputs."""
         memory = self._memory
-        for table, has_outputs in memory.forward:
+        for table, tile, has_outputs in memory.forward:
             arrays = (memory.values, memory.weights, memory.flat, memory.outputs, table)
-            sizes = {"HAS_OUTPUTS": has_outputs, "SAMPLES": SAMPLES}
-            self._product(products.forward, arrays, num_rows // SAMPLES, sizes | products.FORWARD)
+            sizes = {"HAS_OUTPUTS": has_outputs, "SAMPLES": SAMPLES, "TILE": tile}
+            settings = products.FORWARD if tile == TILE else products.NARROW
+            self._product(products.forward, arrays, num_rows // SAMPLES, sizes | settings)
 
     def _product(self, kernel: Any, arguments: tuple, parts: int, settings: dict[str, int]) -> None:
         """Launch a matrix product of all tiles of a table, the last argument, for all parts of the samples."""
         num_tiles, columns = arguments[-1].shape
-        kernel[num_tiles, parts](*arguments, COLUMNS=columns, TILE=TILE, STEP=ALIGNMENT, PRECISION="tf32", **settings)
+        kernel[num_tiles, parts](*arguments, COLUMNS=columns, STEP=ALIGNMENT, PRECISION="tf32", **settings)
 
     def _write_losses(self) -> None:
         """Compute losses and their gradients by the outputs."""
@@ -217,12 +218,12 @@ class TritonPPO(TorchPPO):
         values = (storage.values, storage.advantages, storage.returns)
         counts = (self.batch_size, self._num_samples, size)
         weights = (self.clip_param, self.value_loss_coef, self.entropy_weight)
-        places, strides, columns = self._places
-        samples.losses[(len(memory.sums),)](
+        sums = memory.loss_sums
+        samples.losses[(len(sums),)](
             memory.outputs, *self._std[:3], self._stds, self.indices, *self._action_map, *policy, *values,
-            self.actor_learns, memory.gradients, places, strides, memory.sums, memory.sums.shape[1], columns,
-            *counts, *weights, IS_LOG=self._std[3], CLIP_VALUES=self.use_clipped_value_loss, ROWS=SAMPLES,
-            COLUMNS=triton.next_power_of_2(size), num_warps=16,
+            self.actor_learns, memory.gradients, *self._places, sums, sums.shape[1], *counts, *weights,
+            IS_LOG=self._std[3], CLIP_VALUES=self.use_clipped_value_loss, ROWS=LOSS_SAMPLES,
+            COLUMNS=triton.next_power_of_2(size), num_warps=1,
         )  # fmt: skip
 
     def _weight_gradients(self) -> None:
@@ -230,11 +231,12 @@ class TritonPPO(TorchPPO):
         memory = self._memory
         parts, room = memory.partial.shape
         arguments = (memory.values, memory.gradients, memory.partial, memory.rows // parts, room, memory.weight_tiles)
-        self._product(products.weight_gradient, arguments, parts, products.BACKWARD)
-        size, (rows, columns) = len(memory.flat), memory.sums.shape
-        steps.sum_rows[(triton.cdiv(columns, 32),)](
-            memory.sums, rows, columns, memory.destination, self._gradient, ROWS=128, COLUMNS=32, num_warps=8
-        )
+        self._product(products.weight_gradient, arguments, parts, {"TILE": TILE} | products.BACKWARD)
+        size = len(memory.flat)
+        for sums, to in ((memory.loss_sums, memory.loss_destination), (memory.sums, memory.destination)):
+            steps.sum_rows[(triton.cdiv(sums.shape[1], steps.COLUMNS),)](
+                sums, *sums.shape, to, self._gradient, ROWS=steps.ROWS, COLUMNS=steps.COLUMNS, num_warps=8
+            )
         steps.sum_parts[(triton.cdiv(size, steps.BLOCK),)](
             memory.partial, parts, room, memory.source, self._gradient, size, BLOCK=steps.BLOCK
         )
