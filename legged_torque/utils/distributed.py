@@ -129,14 +129,17 @@ def average(tensors: list[Tensor]) -> None:
     """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph."""
     import torch
 
-    flat = torch.cat([tensor.flatten() for tensor in tensors])
+    flat = tensors[0].view(-1) if len(tensors) == 1 else torch.cat([tensor.flatten() for tensor in tensors])
     if _shared:
         flat = _shared.average(flat)
+    elif torch.distributed.get_backend() == "nccl":
+        torch.distributed.all_reduce(flat, torch.distributed.ReduceOp.AVG)
     else:
         torch.distributed.all_reduce(flat)
         flat /= torch.distributed.get_world_size()
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
-        tensor.copy_(mean.view_as(tensor))
+        if mean.data_ptr() != tensor.data_ptr():
+            tensor.copy_(mean.view_as(tensor))
 
 
 def any_process(condition: bool, device: str) -> bool:
