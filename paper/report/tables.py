@@ -180,6 +180,7 @@ def settings_table(configs: dict[str, dict[str, Any]]) -> Rows:
     """Return the settings in which tasks differ, from a run's settings by task; nothing if there are none."""
     columns = {f"`{task}`": flat({key: config[key] for key in ("env", "train")}) for task, config in configs.items()}
     paths = dict.fromkeys(path for values in columns.values() for path in values)
+    paths.pop("train.runner.experiment_name", None)  # a folder of each training
     rows = [[f"`{path}`", *(str(values.get(path, NOTHING)) for values in columns.values())] for path in paths]
     different = [row for row in rows if len(set(row[1:])) > 1]
     return [["setting", *columns], *different] if different else []

@@ -19,7 +19,7 @@ PUSHES = ("push_velocity", "push_probability")
 """Settings without effect where robots are not pushed."""
 NEUTRAL = {"add": [0.0, 0.0], "scale": [1.0, 1.0], "scale_per_joint": [1.0, 1.0]}
 """Ranges of a random parameter that do not change it, by operation."""
-FREE = ("seed", "evaluation.", "runner.save_interval", "runner.total_steps", "runner.logger")
+FREE = ("seed", "evaluation.", "runner.experiment_name", "runner.save_interval", "runner.total_steps", "runner.logger")
 """Settings that do not change what is learned, or may differ between the runs of one training."""
 
 Trainings = dict[Cell, list[Path]]

@@ -13,17 +13,19 @@ from legged_torque.paper.report.tables import holm, welch
 @pytest.fixture(scope="module")
 def swept():
     """Sweeps of newly trained A1s."""
-    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz")
+    data = pd.read_csv(DOCS / "results" / "robustness.csv.xz")
     return data.set_index(["trained", "parameter", "metric", "from", "task"]).sort_index(kind="stable")["mean"]
 
 
 def trained_as(policy):
     """How a policy of a table was trained, as the data have it, and its task."""
     tasks = TASKS | {"variable stiffness": "a1_variable_stiffness", "decaying PD bias": "a1_decap"}
+    tasks["combination"] = "a1_torque_curriculum_multihead"
     more = {"tuned": "tuned gains", "damping": "damping on the drive", "history": "history of 3"}
-    method, late, how = re.fullmatch(r"(.+), (\d+ ms)((?:, \w+)*)", policy.strip("*")).groups()
+    robot, method, late, how = re.fullmatch(r"(?:(Go2): )?(.+), (\d+ ms)((?:, \w+)*)", policy.strip("*")).groups()
     trained = ", ".join([f"late by 0 to {late}", *(more[each] for each in how.split(", ")[1:])])
-    return {"late by 0 to 10 ms, damping on the drive": "damping on the drive"}.get(trained, trained), tasks[method]
+    task = tasks[method].replace("a1_", f"{(robot or 'a1').lower()}_")
+    return {"late by 0 to 10 ms, damping on the drive": "damping on the drive"}.get(trained, trained), task
 
 
 def test_cures_of_latency(swept):
@@ -31,7 +33,7 @@ def test_cures_of_latency(swept):
     columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
     columns += [("push_velocity", "fell", 3.5)]
     _, rows = rows_of("results.md", "policy, latest actions in training")
-    assert len(rows) == 16
+    assert len(rows) == 19
     for policy, seeds, *cells in rows:
         trained, task = trained_as(policy)
         for cell, column in zip(cells, columns, strict=True):
@@ -49,10 +51,24 @@ def test_cures_of_latency(swept):
     assert f"(difference {change:.3f}, 95% interval {low:.3f} to {high:.3f})" in text
     assert f"over {fell.mean():.2f} instead of {fell_pd.mean():.2f} (p = {welch(fell, fell_pd):.3f};" in text
     assert f"tracks {later_pd.mean() - later.mean():.3f} less" in text
-    assert f"alone give {torque.iloc[3:].mean():.3f} and {fell.iloc[3:].mean():.2f}" in text
+    before = [
+        swept.loc[(f"{trained} (earlier)", *column, task)].mean()
+        for column in (columns[1], columns[3])
+        for trained, task in ((recipe, "a1_torque"), (tuned, "a1_position"))
+    ]
+    assert "gave {:.3f} against {:.3f}, and {:.2f} against {:.2f}.".format(*before) in text
     damped, past = (swept.loc[(f"late by 0 to 20 ms, {how}", *columns[1], "a1_torque")] for how in more)
     assert f"tracks {damped.mean():.3f} (p = {welch(damped, torque):.2f}, three seeds against seven)" in text
-    assert "history alone {0:.3f}, {2:.3f} and {1:.3f}".format(*past) in text
+    assert "alone {0:.3f}, {2:.3f} and {1:.3f}".format(*past) in text
+    own, pd_20 = (
+        [swept.loc[(trained, *column, task)] for column in columns[1:]]
+        for trained, task in ((recipe, "go2_torque"), (tuned, "go2_position"))
+    )
+    low, high = stats.ttest_ind(own[0], pd_20[0], equal_var=False).confidence_interval()
+    (at_20, at_30, falls), (pd_at_20, pd_at_30, pd_falls) = ([part.mean() for part in parts] for parts in (own, pd_20))
+    said = f"tracks {pd_at_20 - at_20:.3f} less than tuned PD (95% interval {low:.3f} to {high:.3f}), at 30 ms "
+    said += f"{pd_at_30 - at_30:.3f} (p = {welch(own[1], pd_20[1]):.3f}); pushes knock over {falls:.2f} instead of "
+    assert f"{said}{pd_falls:.2f} (p = {welch(own[2], pd_20[2]):.2f})" in text
     fast = swept.loc["policy at 200 Hz", "action_delay", "track_percentage", 0.0, "a1_torque_multihead"]
     assert f"track {fast.min():.2f} to {fast.max():.2f} without latency after" in text
 
@@ -60,68 +76,58 @@ def test_cures_of_latency(swept):
 @pytest.fixture(scope="module")
 def conditions():
     """What was measured in other conditions."""
-    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz").sort_values("seed")
+    data = pd.read_csv(DOCS / "results" / "robustness.csv.xz").sort_values("seed")
     data = data[data["parameter"].str.startswith("condition ")]
     return data.assign(condition=data["parameter"].str.removeprefix("condition ").str.replace("_", " "))
 
 
+MEASURED = {"undisturbed": ("as trained", "track_percentage"), "torques change": ("as trained", "torque_rate")}
+MEASURED |= {"noise x 4": ("noise 4 times", "track_percentage"), "falls, dead leg": ("dead leg", "falls_per_minute")}
+"""Condition and metric of columns; others are tracking in the condition of their name."""
+
+
 def test_table_of_conditions(conditions):
-    """Tracking of each seed, and of the undisturbed its range and that of how fast torques change."""
-    columns, rows = rows_of("results.md", "policy | undisturbed")
-    assert len(rows) == 8
-    for policy, *cells in rows:
-        trained, task = trained_as(policy)
-        own = conditions[(conditions["trained"] == trained) & (conditions["task"] == task)]
-        tracking = own[own["metric"] == "track_percentage"].set_index("condition")
-        found = [
-            tracking["mean"]["as trained"],
-            own[own["metric"] == "torque_rate"].set_index("condition")["mean"]["as trained"],
-        ]
-        found = [f"{found[0].min():.3f} to {found[0].max():.3f}", f"{found[1].min():.0f} to {found[1].max():.0f}"]
-        for column in columns[3:]:
-            marks = tracking["commit"].eq("e45a78f") & (column == "off centre")
-            texts = tracking["mean"].map("{:.3f}".format) + marks.map({True: "†", False: ""})
-            found.append(", ".join(texts.loc[[column.replace("x 4", "4 times")]]))
-        assert cells == found, policy
+    """Means over seeds, and which differ significantly from PD for 10 ms, the last row from PD for 20 ms."""
+    columns, rows = rows_of("results.md", "policy | seeds | undisturbed")
+    of = conditions.set_index(["trained", "task", "condition", "metric"]).sort_index(kind="stable")["mean"]
+    assert len(rows) == 9
+    for number, column in enumerate(columns[2:]):
+        measured = MEASURED.get(column, (column, "track_percentage"))
+        values = [of[(*trained_as(policy), *measured)] for policy, *_ in rows]
+        differs = [False, *(p < 0.05 for p in holm([welch(each, values[0]) for each in values[1:7]])), False]
+        differs.append(welch(values[8], values[7]) < 0.05)
+        digits = 3 if measured[1] == "track_percentage" else 0
+        found = [f"{each.mean():.{digits}f}" + "*" * int(star) for each, star in zip(values, differs, strict=True)]
+        assert [cells[1 + number] for _, *cells in rows] == found, column
+        assert [int(cells[0]) for _, *cells in rows] == [*map(len, values)]
 
 
 def test_other_conditions(conditions):
-    """What is said of smoothness, of a trunk off centre, of drops and of a leg without torques."""
+    """What is said of smoothness, drops, ideal motors and SATA."""
     text, late = text_of("results.md", "**Other conditions**"), "late by 0 to 10 ms"
-    of = conditions.set_index(["condition", "metric", "trained", "task"]).sort_index(kind="stable")["mean"]
-    rates = dict(list(of["as trained", "torque_rate", late].groupby("task")))
-    own = rates.pop("a1_position")
-    p = dict(zip(rates, holm([welch(rate, own) for rate in rates.values()]), strict=True))
-    assert {task for task in p if p[task] < 0.05} == {"a1_torque_multihead", "a1_torque", "a1_decap"} and len(p) == 6
-    recipe = of["as trained", "torque_rate", f"{late[:-5]}20 ms, damping on the drive, history of 3", "a1_torque"]
-    assert f"{recipe.mean():.0f} against {own.mean():.0f}." in text and recipe.min() > own.mean()
-    tracking = of.xs("track_percentage", level="metric").xs(late, level="trained")
-    names = ["a1_torque_curriculum", "a1_position", "a1_torque"]
-    lost = [
-        tracking.loc[[("as trained", name)]].iloc[0] - tracking.loc[[("off centre", name)]].iloc[0] for name in names
-    ]
-    said = "curriculum loses {:.3f} of tracking, PD {:.3f}, default torque {:.3f}."
-    assert said.format(*lost) in text
-    drops, lame = (of[name, "falls_per_minute"] for name in ("drop 50 cm", "dead leg"))
-    assert f"more than {drops.max():.2f} times a minute; without the torques of a leg, all fell " in text
-    assert f"all fell {lame.min():.0f} to {lame.max():.0f} times." in text
+    of = conditions.set_index(["trained", "condition", "metric", "task"]).sort_index(kind="stable")["mean"]
+    rates = of[late, "as trained", "torque_rate"].groupby("task").mean().drop("a1_sata")
+    slower = {"a1_torque_multihead", "a1_torque", "a1_decap", "a1_variable_stiffness"}
+    assert set(rates[rates < rates["a1_position"]].index) - {"a1_torque_curriculum_multihead"} == slower
+    drops = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").groupby(level=[0, 1]).mean()
+    assert f"no approach falls more than {drops.max():.1f} times a minute" in text
+    base = text_of("results.md", "- **Trained with ideal motors**")
+    ideal = of["ideal motors, no latency"].xs("track_percentage", level="metric")
+    mean = ideal.groupby(level=[0, 1]).mean().unstack(level=0)
+    assert (mean["real motors"] - mean["as trained"]).abs().max() < 0.0015 and len(ideal) == 45
+    lost = (mean["as trained"] - mean["real motors 10 ms"])[["a1_position", "a1_torque_multihead", "a1_torque"]]
+    assert "PD loses {:.3f}, torque multi-head {:.3f} and default torque {:.3f}".format(*lost) in base
+    sata = of[late, "as trained", "track_percentage", "a1_sata"]
+    assert f"{len(sata)} seeds track {sata.min():.2f} to {sata.max():.2f}".replace("3 seeds", "three seeds") in base
 
 
 def test_repeated_trainings():
     """The same settings and seed on another machine, by commits that train alike, give the same sweeps."""
-    again, key = pd.read_csv(DOCS / "results" / "repeated.csv.gz"), ["task", "trained", "seed", "parameter", "from"]
-    data = pd.read_csv(DOCS / "results" / "robustness.csv.gz").query("metric == 'track_percentage'")
-    for each in (again, data):
-        each["from"] = each["from"].round(3)
-    both = again.merge(data, on=key)
-    apart = (both["track_percentage"] - both["mean"].round(4)).abs()
-    latency = both["parameter"].str.endswith("_delay")
-    assert len(both) == len(again) and (both["commit_x"] != both["commit_y"]).all()
-    assert len(both[latency].groupby(key[:3])) == 28 and apart[latency].max() < 1e-6
-    text, voltage = text_of("results.md", "## What policies bear"), apart[~latency]
-    assert f"28 trainings, repeated with {again['commit'].unique().item()}" in text
-    assert f"seed 1 of five approaches tracks the same to {voltage.max():.3f}." in text
-    assert again[again["parameter"] == "trunk_mass"]["task"].nunique() == 5
+    data = pd.read_csv(DOCS / "results" / "repeated.csv.gz")
+    apart = (data["track_percentage"] - data["first"].round(4)).abs()
+    assert len(data.groupby(["task", "trained", "seed"])) == 28 and apart.max() < 1e-6
+    assert (data["commit"] != data["first_commit"]).all()
+    assert "to four digits in 28 of 28 sweeps of latency" in text_of("results.md", "## What policies bear")
 
 
 def test_what_policies_bear(swept):
