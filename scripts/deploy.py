@@ -24,6 +24,7 @@ from legged_torque.utils.limits import Limits, Positive, Rate
 
 ROBOT = "go2"  # at the other end of a network interface
 POLL = 0.01  # seconds between two looks at keys and other devices
+MOST_COMMANDS = 500.0  # a second, without --rate
 
 
 def parse_args() -> argparse.Namespace:
@@ -34,7 +35,8 @@ def parse_args() -> argparse.Namespace:
     hint += "or sdk for an A1 or Go1 through unitree_legged_sdk"
     parser.add_argument("--interface", required=True, help=hint)
     parser.add_argument("--domain", type=int, default=0, help="of DDS; Unitree's robots: 0; default: %(default)s")
-    parser.add_argument("--rate", type=float, default=500.0, help="commands per second; default: %(default)s")
+    hint = "commands per second; default: the largest multiple of the policy's rate up to 500"
+    parser.add_argument("--rate", type=float, help=hint)
     parser.add_argument(
         "--command",
         type=float,
@@ -74,7 +76,9 @@ def main() -> None:
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.session import Session
         from legged_torque.runtime.view import View
-    policy = chirp(args, Policy(args.policy)) if args.chirp else Policy(args.policy)
+    policy: Any = Policy(args.policy)
+    args.rate = args.rate or default_rate(policy.description["timing"]["control_frequency"])
+    policy = chirp(args, policy) if args.chirp else policy
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
     operators = operators_of(args, controller)
@@ -107,6 +111,11 @@ def main() -> None:
         raise loop.error
     if session.stops:
         sys.exit(1)
+
+
+def default_rate(of_policy: float) -> float:
+    """Return the commands per second for so many actions: their largest multiple up to 500, or as many."""
+    return of_policy * max(1.0, MOST_COMMANDS // of_policy)
 
 
 def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:

@@ -272,7 +272,7 @@ def test_few_worlds():
     columns = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
     walking = data[data["track_percentage"] >= 0.7].groupby([*columns, "task", "seed"])["steps"].min() / 1e6
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 5 and data[columns].drop_duplicates().shape[0] == 30
+    assert len(rows) == 5 and data[columns].drop_duplicates().shape[0] == 38
     for size, batches, epochs, *cells, _ in rows:
         shape, *others = (
             size.replace("lambda ", "lam=")
@@ -286,6 +286,20 @@ def test_few_worlds():
             mean, latest = cell.partition(" (")[0].split(", ")
             assert same(mean, steps.mean()) and same(latest, steps.max()), (size, task, steps)
             assert cell[len(f"{mean}, {latest}") :] == ("" if len(steps) == 4 else f" ({len(steps)})")
+    go2, text = (
+        walking.xs("go2_torque_multihead", level="task").groupby("other"),
+        text_of("tried.md", "For the Go2 alone"),
+    )
+    for other, words in (
+        ("again", "again: "),
+        ("stiffness=30", "stiffness of 30 gave "),
+        ("stiffness=25", "of 25 "),
+        ("torque_scale=8", "`torque_scale` 8 "),
+        ("action_scale=0.35", "`action_scale` 0.35 "),
+        ("init_std=0.7", "`init_std` 0.7 "),
+    ):
+        steps = go2.get_group(f"lam=0.9 gamma=0.97 {other}")
+        assert f"{words}{steps.mean():.1f}, {steps.max():.1f}" in text and len(steps) == 4, other
 
 
 def test_laptop():

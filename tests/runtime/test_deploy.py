@@ -17,6 +17,7 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.log import RecordedLog
 from legged_torque.runtime.sim_robot import SimRobot
 
 RATE, DOMAIN, OTHER = 500.0, 200 + os.getpid() % 16, 216 + os.getpid() % 16
@@ -149,6 +150,8 @@ def test_scripts(make_task, exported, tmp_path):
         given = [str(exported)] if script == "deploy.py" else []
         assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)
     assert_told_in_one_line(run_here(*replay, "--limit=-1", root=tmp_path), "limit")
-    export_random(make_task, "a1_torque", tmp_path / "a1")
+    export_random(make_task, "a1_torque", tmp_path / "a1", **{"control.decimation": 1})  # at 200 Hz
+    assert run_here("deploy.py", "a1", "--interface=sim", "--seconds=0.3", "--log=fast.mcap", root=tmp_path)[0] == 0
+    assert RecordedLog(tmp_path / "fast.mcap").period == 1 / 400
     refused = run_here("deploy.py", "a1", "--interface=lo", root=tmp_path)
     assert_told_in_one_line(refused, "the policy is of the robot 'a1'")
