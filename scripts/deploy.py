@@ -115,7 +115,7 @@ def main() -> None:
 
 def default_rate(of_policy: float) -> float:
     """Return the commands per second for so many actions: their largest multiple up to 500, or as many."""
-    return of_policy * max(1.0, MOST_COMMANDS // of_policy)
+    return of_policy * max(1.0, (MOST_COMMANDS + 1e-6) // of_policy)
 
 
 def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:

@@ -129,16 +129,14 @@ def average(tensors: list[Tensor]) -> None:
     """Replace tensors by their means over all processes, in one exchange; can be captured in a CUDA graph."""
     import torch
 
-    flat = tensors[0].view(-1) if len(tensors) == 1 else torch.cat([tensor.flatten() for tensor in tensors])
+    flat = tensors[0].flatten() if len(tensors) == 1 else torch.cat([tensor.flatten() for tensor in tensors])
     if _shared:
         flat = _shared.average(flat)
-    elif torch.distributed.get_backend() == "nccl":
-        torch.distributed.all_reduce(flat, torch.distributed.ReduceOp.AVG)
     else:
         torch.distributed.all_reduce(flat)
         flat /= torch.distributed.get_world_size()
     for tensor, mean in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
-        if mean.data_ptr() != tensor.data_ptr():
+        if mean.data_ptr() != tensor.data_ptr():  # a single tensor has changed in place
             tensor.copy_(mean.view_as(tensor))
 
 

@@ -13,7 +13,7 @@ from legged_torque.learning.ppo.triton.networks import Block, Columns, Layer, al
 SAMPLES = 128  # of a tile of a matrix product
 TILE = 128  # columns of it
 NARROW_TILE = 64  # of gradients of what layers read, and of layers that are no wider
-LOSS_SAMPLES = 16  # of a program that computes losses; with 128 it takes 2.5 times as long
+LOSS_SAMPLES = 16  # of a program that computes losses; with 128 it takes twice as long
 NUMBERS = 4  # that follow the gradients: value loss, surrogate loss, entropy, KL divergence
 SAMPLES_PER_PART = 1024  # of which gradients of weights are summed up by one program, if there are not too many
 MAX_PARTS = 6  # with the default networks, an H100 computes all tiles of so many parts at once
@@ -32,7 +32,7 @@ class Memory:
         source: Where in ``weights`` each parameter is, -1 for others than weights. Shape: (parameters,), int32.
         loss_destination: Which gradient each column of ``loss_sums`` belongs to, -1 for none; the first ones are
             numbers that stand behind all gradients. Shape: (columns,), int32.
-        destination: The same for ``sums``.
+        destination: Which gradient each column of ``sums`` belongs to, -1 for none. Shape: (columns,), int32.
         rows: Samples of a minibatch, up to whole tiles.
         values: Inputs, and what all layers have computed. Shape: (numbers,).
         outputs: Outputs of the actor, then of the critic, in float32. Shape: (rows, outputs).
