@@ -316,7 +316,5 @@ def test_laptop():
     texts = {task: [f"{s // 60:.0f}:{s % 60:02.0f}" for s in times] for task, times in seconds.groupby("task")}
     first, second, third, fourth = texts["a1_torque_multihead"]
     assert f"after {first}, {second}, {third} and {fourth} minutes of training (seeds 1 to 4)" in text
-    assert "`a1_position` after {} and {},".format(*texts["a1_position"]) in text
-    last = data[data["task"] == "go2_torque_multihead"].query("seed == 1").iloc[-1]
-    said = f"{last['track_percentage']:.0%} after {last['seconds'] // 60:.0f}:{last['seconds'] % 60:02.0f}"
-    assert f"`go2_torque_multihead` {said} (stopped) and, seed 2, 70% after {texts['go2_torque_multihead'][0]}" in text
+    assert "`a1_position` after {}, {}, {} and {}, at most".format(*texts["a1_position"]) in text
+    assert "seeds 1 to 3, after {}, {} and {} (ad0b145;".format(*texts["go2_torque_multihead"]) in text
