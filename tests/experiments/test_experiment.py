@@ -111,7 +111,7 @@ def test_what_is_done_is_not_done_again(finished, tmp_path):
     assert " of CPU time for training; 512 steps of training, " in spent
 
 
-CELLS = {"paper": 210, "hard": 28, "low": 12, "smoke": 2, "rough": 16, "robustness": 35, "table_ii": 20}
+CELLS = {"paper": 210, "hard": 28, "low": 12, "smoke": 2, "rough": 16, "robustness": 35, "robots": 36, "table_ii": 20}
 
 
 @pytest.mark.parametrize(("name", "cells"), CELLS.items())
@@ -123,7 +123,7 @@ def test_dry_run(name, cells, tmp_path):
     assert (status, error) == (0, "") and not out.exists()
     assert len(output.splitlines()) == cells
     assert output.count(", rough ground\n") == (16 if name == "rough" else 0)
-    assert output.count(", sweep of push_velocity, ") == (35 if name == "robustness" else 0)
+    assert output.count(", sweep of push_velocity, ") == (cells if name.startswith("rob") else 0)
     assert ("a1_multihead-high_frequency-s4: train, evaluate in high_frequency, doubled" in output) == (name == "paper")
 
 
