@@ -280,9 +280,18 @@ def test_performance():
         assert int(worlds) == row["worlds"] and same(million, row["iteration_steps_per_s"] / 1e6)
         assert all(same(text, row[key]) for text, key in zip(times, keys, strict=True)), row
         assert same(memory, row["peak_memory_mib"] / 1024)
-    start = next(each for each in data if "--timing" in each["what"])
+    start = next(each for each in data if "warm" in each)
     until = [sum(list(times.values())[:4]) for times in (start["warm"][0], start["cold"])]
     assert "{:.0f} s pass with warm caches and {:.0f} s".format(*until) in text_of("performance.md", "- **Start.**")
+    two = next(each for each in data if "two_gpus" in each)
+    both, one = (two[f"{name}_steps_per_s"] for name in ("two_gpus", "one_gpu"))
+    text = text_of("performance.md", "- **Two GPUs**")
+    assert f"make {both / 1e6:.1f} million steps/s, {both / one:.2f} times those of one" in text
+    more = [two["two_gpus"][name] - two["one_gpu"][name] for name in ("updates", "logs and checkpoints")]
+    assert (
+        "updates take {:.1f} s more, logs and checkpoints, with the worlds of both processes, {:.1f} s".format(*more)
+        in text
+    )
     _, rows = rows_of("performance.md", "trainer | settings")
     compared = [*data[1]["rows"][:2], *data[-1]["rows"]]
     for row, (_, _, _, step, iteration, _, _, tracking) in zip(compared, rows[:3], strict=True):
