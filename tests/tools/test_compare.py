@@ -57,6 +57,7 @@ def test_our_side(tmp_path, monkeypatch):
     words = {"settings": "equal", "engine": "fused", "num_envs": 2, "iterations": 2, "seed": 1, "device": "cpu"}
     words |= {"started": 0.0, "out": tmp_path / "row.json"}
     monkeypatch.setattr(measure, "INTERVAL", 2)
+    monkeypatch.setattr(measure, "NUM_COMMANDS", 2)
     monkeypatch.setattr(sys, "argv", ["ours", *(f"--{name}={value}" for name, value in words.items())])
     ours.main()
     row = json.loads((tmp_path / "row.json").read_text())
