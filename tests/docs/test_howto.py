@@ -246,12 +246,10 @@ def test_commands(page, tmp_path, monkeypatch):
             lines = block.replace("\\\n", " ").strip().splitlines()
             assert len(calls) == len(lines), f"{page}:{line}"
             for script, words in calls:
-                changes = (
-                    [*TINY, "--set=control.refresh_torques=false"] if "motor" in page else TINY
-                )  # with a shared kernel
+                held = ["--set=control.refresh_torques=false"] if "motor" in page else []  # with a shared kernel
                 is_training = script == "train.py" and not {"--list", "--help"} & set(words)
                 if script:
-                    result = run_here(script, *words, *(changes if is_training else []), root=tmp_path)
+                    result = run_here(script, *words, *([*TINY, *held] if is_training else []), root=tmp_path)
                 else:
                     result = command()
                 assert (result[0], result[2]) == (0, "") and result[1], [script, *words]

@@ -6,11 +6,8 @@ import sys
 
 import matplotlib.pyplot as plt
 import nbformat
-import pytest
-from support.scripts import ROOT, run_here
-
-pytest.importorskip("IPython")
 from IPython.core.interactiveshell import InteractiveShell
+from support.scripts import ROOT, run_here
 
 
 class Shell(InteractiveShell):
@@ -21,7 +18,7 @@ class Shell(InteractiveShell):
         _, command, script, *words = shlex.split(self.var_expand(line))
         assert command == "legged-torque"
         if script == "train":
-            assert run_here("train.py", *words, root=os.getcwd())[0] == 0
+            assert run_here("train.py", *words, root=".")[0] == 0
         else:
             self.system_raw(line)
 
@@ -34,15 +31,14 @@ def test_first_steps(tmp_path, monkeypatch):
     tagged = {tag: cell for cell in notebook.cells for tag in cell.metadata.get("tags", ())}
     tagged["install"].source, tagged["options"].source = "", f"TRAINING, VIDEO = '{few}', '--num_envs 1 --steps 2'"
     monkeypatch.setenv("PATH", os.path.dirname(sys.executable), prepend=os.pathsep)
-    monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "settings"))
+    monkeypatch.delenv("MUJOCO_GL")
     monkeypatch.setitem(sys.modules, "__main__", sys.modules["__main__"])  # given back: the shell takes its place
     monkeypatch.chdir(tmp_path)
-    shell, video = Shell(), None
+    shell = Shell()
     for cell in notebook.cells:
         if cell.cell_type == "code":
             done = shell.run_cell(cell.source)
             done.raise_error()
-            video = done.result
     (line,) = plt.gca().lines
-    assert len(line.get_xdata()) == 2 and "<video" in video._repr_html_() and (tmp_path / "walk.mp4").is_file()
+    assert len(line.get_xdata()) == 2 and "<video" in done.result._repr_html_() and (tmp_path / "walk.mp4").is_file()
