@@ -40,7 +40,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 def killed(tmp_path_factory):
     """A smoke experiment that was killed in the middle of its training: its file, its folder, its output."""
     values = yaml.safe_load((ROOT / "experiments" / "smoke.yaml").read_text())
-    values["train"] |= {"runner.total_steps": 16 * 32, "runner.save_interval": 2}
+    values["train"] |= {"runner.total_steps": 16 * 32, "runner.save_interval": 2, "evaluation.interval": 0}
     values |= {"tasks": ["a1_torque_multihead"], "environments": {"low": ["high"]}}
     tmp_path = tmp_path_factory.mktemp("killed")
     file, out = write(tmp_path / "smoke.yaml", values), tmp_path / "out"

@@ -185,9 +185,8 @@ def test_what_a_training_has_measured_is_not_evaluated_again(stage, tmp_path):
     (stage / "behaviour").write_text("measure evaluations.csv evaluations_high.csv")
     status, output, error = experiment_here(*words, tmp_path=tmp_path)
     assert (status, error) == (0, "") and "1 of 1 cells are done" in output and "evaluation in" not in output
-    assert not list(out.glob("*/result*")) and "'--set=evaluation.also=[\"high\"]'" in (
-        next(out.glob("*/train.log")).read_text()
-    )
+    assert not list(out.glob("*/result*"))
+    assert "'--set=evaluation.also=[\"high\"]'" in next(out.glob("*/train.log")).read_text()
     next(out.glob("*/*/evaluations_high.csv")).write_text("steps\n")  # the disk was full
     assert experiment_here(*words, "--dry-run", tmp_path=tmp_path)[1] == "a1_torque-low-s1: evaluate in high\n"
     (checkpoint,) = out.glob("*/*/model_4.pt")
@@ -210,9 +209,8 @@ def test_tiles_are_crossed_after_training(stage, tmp_path):
     assert " --num_envs=40 --terrain flat pits --level 0.0 0.5 " in log and "--perturbation" not in log
     assert json.loads(result.read_text())["experiment_name"] == cell.name and not list(cell.glob("*.part"))
     swept = json.loads((cell / "sweep_ground_friction.json").read_text())  # test_sweep.py gives it to the script
-    assert (swept["sweep"], swept["perturbation"]) == ("ground_friction", "none") and swept["set"].startswith(
-        "domain_rand.ground_friction="
-    )
+    assert (swept["sweep"], swept["perturbation"]) == ("ground_friction", "none")
+    assert swept["set"].startswith("domain_rand.ground_friction=")
     late = json.loads((cell / "condition_late.json").read_text())
     assert (late["perturbation"], late["set"]) == ("none", "motors.delay.range=[2, 2]") and "sweep" not in late
     result.unlink()

@@ -55,9 +55,8 @@ def test_known_numbers(found):
     before, after = result["held_out"]
     np.testing.assert_allclose(after, [[5e-4] * 3, [0.05] * 3], rtol=0.1)
     assert (before[0] > 20 * after[0]).all()
-    assert re.search(r"FR_thigh_joint +0.02[34]\d* \+- 1?\de-0[56] ", output) and re.search(
-        r"delay \d.\d\d \+-", output
-    )
+    assert re.search(r"FR_thigh_joint +0.02[34]\d* \+- 1?\de-0[56] ", output)
+    assert re.search(r"delay \d.\d\d \+-", output)
 
 
 def test_settings(found):
@@ -77,13 +76,13 @@ def problem_of(leg, recording):
 
 
 def test_intervals(leg):
-    """Of 13 numbers in three logs, 34 or more are within their 95% intervals, and not all by far."""
+    """Of 13 numbers in two logs, 23 or more are within their 95% intervals, and not all by far."""
     known, errors = record(leg, sweep(5.0), step=1e-3, half=0.5), []
-    for seed in range(3):
+    for seed in range(2):
         problem = problem_of(leg, noisy(known, seed))
         numbers, _, equations = problem.refine(NUMBERS * 1.01, lambda: None)
         errors.append(np.abs(numbers - NUMBERS) / problem.half_widths(numbers, equations))
-    assert (np.array(errors) < 1.0).sum() >= 34 and (np.array(errors) > 0.3).sum() >= 10
+    assert (np.array(errors) < 1.0).sum() >= 23 and (np.array(errors) > 0.3).sum() >= 7
 
 
 STILL, STEADY = sweep(6.0, last=1.0), np.array(list(POSE.values())) + 1e-4 * np.arange(3000)[:, None]
@@ -102,10 +101,8 @@ STILL[:, 2] = POSE["FR_calf_joint"]
 )
 def test_refused(leg, targets, bias, problems):
     """A joint at rest, a single low speed, a motion too small, a number at the end of what is searched."""
-    problem, numbers = (
-        problem_of(leg, noisy(record(leg, targets, step=1e-3))),
-        np.where(NUMBERS == -0.047, bias, NUMBERS),
-    )
+    problem = problem_of(leg, noisy(record(leg, targets, step=1e-3)))
+    numbers = np.where(NUMBERS == -0.047, bias, NUMBERS)
     parts = error_of(problem.half_widths, numbers, problem._linearized(numbers)[1]).split("; ")
     assert all(any(re.match(expected, part) for part in parts) for expected in problems), parts
     assert targets is not STILL or all(" of FR_calf_joint is known to +-" in part for part in parts)

@@ -1,11 +1,12 @@
 """Training in two processes: one policy, one run, and what every process does of its own.
 
-Started by torchrun (:func:`train_together`), this file is the process that trains and notes what it sees.
+Started by torchrun, this file is the process that trains and notes what it sees.
 """
 
 import contextlib
 import os
 import re
+import runpy
 import shutil
 import signal
 import socket
@@ -37,8 +38,8 @@ SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--s
 SMALL += ["--set=algorithm.annealing_start=1", "--set=evaluation.interval=0"]  # trainings of other lengths are compared
 TASK = "a1_multihead"
 FOREVER = 1_000_000
-GOES_ON = f"iteration 5 of {FOREVER + 4}"
-"""What the first process prints when both train until torchrun is killed."""
+RUN = Path("0", TASK, "2026-01-01_00-00-00")
+"""The run of two iterations, which only the first machine has."""
 FORMULA = {"num_mini_batches": 1, "schedule": "adaptive", "max_grad_norm": 1e6, "learning_rate": 1e-3}
 MULTI_GPU = {"world_size": 2, "local_rank": 0}
 
@@ -68,12 +69,12 @@ def everything(runner):
 
 
 def train(folder):
-    """Train, stop when the second process is asked to, save, load in both processes, and go on until torchrun ends."""
+    """Train, stop when the second process is asked to, save, load in both processes, and go on."""
     runner = make_runner(folder / "logs")
     start = everything(runner)
     runner.learn(2, init_at_random_ep_len=True)
     notes = {"start": start, "trained": everything(runner), "observations": runner.env.obs_buf["policy"].clone()}
-    kept = folder / "kept"  # as it would be if training had stopped here
+    kept = folder / RUN  # as it would be if training had stopped here
     if distributed.rank() == 0:
         shutil.copytree(runner.log_dir, kept)
     distributed.any_process(False, "cpu")  # waits for the copy
@@ -99,9 +100,6 @@ def train(folder):
     normalized.learn(2)
     notes["normalized"] = everything(normalized)
     notes["given_up"] = give_up()
-    runner.learn(FOREVER)
-    notes["left alone"] = everything(runner)
-    runner.close()
     return notes
 
 
@@ -136,19 +134,30 @@ def average():
 
 
 def main(folder):
-    """Do both and keep the notes."""
+    """Do both and keep the notes; then resume with train.py, each in a folder of its own, until torchrun ends."""
     distributed.join("cpu")
     notes = {"average": average(), **train(folder)}
     torch.save(notes, folder / f"{distributed.rank()}.pt")
+    words = [f"--task={TASK}", "--device=cpu", "--logger=none", "--verbose", "--resume"]
+    words += [f"--max_iterations={FOREVER}", "--set=runner.save_interval=1"]
+    sys.argv = ["train.py", *words, f"--log_root={folder / str(distributed.rank())}"]
+    runpy.run_path(str(ROOT / "scripts" / "train.py"), run_name="__main__")
 
 
-def torchrun(*words, launch=("--standalone", "--nproc_per_node=2")):
-    """Start processes that find each other, two on this machine unless ``launch`` says otherwise."""
+def torchrun(*words):
+    """Start a process on each of two machines, here the same one, with the options of the page about clusters."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
     environment = os.environ | PATHS | {"PYTHONUNBUFFERED": "1", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "torch.distributed.run", *launch, *map(str, words)]
-    return subprocess.Popen(
-        command, cwd=ROOT, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    )
+    how = {"cwd": ROOT, "env": environment, "text": True, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    page = (ROOT / "docs" / "howto" / "cluster.md").read_text()
+    ours = {"--nproc_per_node": 1, "--master_addr": "127.0.0.1", "--master_port": port}
+    for line in re.findall(r"^torchrun (.+) scripts/train.py", page, flags=re.MULTILINE):  # as they stand there
+        options = dict(word.split("=") for word in line.split())
+        assert ours.keys() < options.keys()
+        launch = [f"{name}={value}" for name, value in (options | ours).items()]
+        yield subprocess.Popen([sys.executable, "-m", "torch.distributed.run", *launch, *map(str, words)], **how)
 
 
 def read_until(process, text):
@@ -163,14 +172,18 @@ def read_until(process, text):
 
 @pytest.fixture(scope="module")
 def together(tmp_path_factory):
-    """The folder in which two processes have trained, and the notes of both."""
+    """The folder in which two processes have trained, the notes of both, and what each of both has printed."""
     folder = tmp_path_factory.mktemp("together")
-    with torchrun(__file__, folder) as process:
-        output = read_until(process, GOES_ON)
-        process.kill()
-        output += process.communicate(timeout=300)[0]  # which waits for all of them
-    assert {file.name for file in folder.glob("?.pt")} == {"0.pt", "1.pt"}, output
-    return folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)], output
+    (folder / "1").mkdir()
+    with contextlib.ExitStack() as stack:
+        both = [stack.enter_context(process) for process in torchrun(__file__, folder)]
+        output = read_until(both[0], "Learning iteration 5/")
+        for process in both:
+            process.kill()
+        output += both[0].communicate(timeout=300)[0]  # which waits for all of them
+        other = both[1].communicate(timeout=300)[0]
+    assert {file.name for file in folder.glob("?.pt")} == {"0.pt", "1.pt"}, output + other
+    return folder, [torch.load(folder / f"{rank}.pt", weights_only=True) for rank in range(2)], output, other
 
 
 def same(first, second):
@@ -180,7 +193,7 @@ def same(first, second):
 
 def test_one_policy_in_different_worlds(together):
     """Both start with other numbers, see other things, and yet have the same networks, moments and learning rate."""
-    _, (first, second), _ = together
+    _, (first, second), *_ = together
     assert not same(first["start"], second["start"])
     assert not torch.equal(first["observations"], second["observations"])
     for moment in ("trained", "stopped", "resumed", "normalized"):
@@ -191,7 +204,7 @@ def test_one_policy_in_different_worlds(together):
 
 def test_steps_of_both_count(together):
     """The task's counter, on which curricula depend, and the checkpoint's are those of both processes."""
-    folder, (first, second), output = together
+    folder, (first, second), output, _ = together
     for notes in (first, second):
         assert int(notes["trained"]["total_steps"]) == 2 * ALL_STEPS
     (run,) = (folder / "logs").iterdir()
@@ -205,25 +218,16 @@ def test_steps_of_both_count(together):
 
 def test_a_signal_to_one_process_stops_both(together):
     """Both finish the iteration in which the second one was asked to stop, and the first one saves."""
-    folder, (first, second), _ = together
+    folder, (first, second), *_ = together
     assert int(first["stopped"]["iterations"]) == int(second["stopped"]["iterations"]) == 4
     (run,) = (folder / "logs").iterdir()
-    last = int(first["left alone"]["iterations"])
-    files = {"config.yaml", f"worlds_{last}.pt", *(f"model_{iterations}.pt" for iterations in (0, 2, 3, 4, last))}
+    files = {"config.yaml", "worlds_4.pt", *(f"model_{iterations}.pt" for iterations in (0, 2, 3, 4))}
     assert {path.name for path in run.iterdir() if path.is_file()} >= files
-
-
-def test_processes_end_with_torchrun(together):
-    """If it is killed, they save the iteration that both have finished, and end."""
-    folder, (first, second), _ = together
-    assert same(first["left alone"], second["left alone"])
-    last = find_checkpoint(next((folder / "logs").iterdir()), None)
-    assert checkpoint_number(last) == int(first["left alone"]["iterations"]) > 4
 
 
 def test_both_resume(together):
     """Both continue from the checkpoint, each in its worlds: the next iteration is that of the run, bit by bit."""
-    _, (first, second), output = together
+    _, (first, second), output, _ = together
     assert same(first["resumed"], first["third"]) and same(second["resumed"], second["third"])
     assert not same(first["third"], first["trained"]) and "start anew" not in output
     assert same(first["loaded"], second["loaded"]) and same(first["loaded"], first["trained"])
@@ -232,7 +236,7 @@ def test_both_resume(together):
 
 def test_both_give_up(together):
     """Both stop after the same iteration, since three of all four worlds are bad; the first one warns."""
-    _, (first, second), output = together
+    _, (first, second), output, _ = together
     assert first["given_up"] == second["given_up"]
     assert first["given_up"]["iterations"] == 1 + PATIENCE
     assert "75%" in first["given_up"]["reason"] and "buffer 'commands' 3" in first["given_up"]["reason"]
@@ -241,7 +245,7 @@ def test_both_give_up(together):
 
 def test_gradients_and_losses_are_those_of_all_samples(together):
     """Losses over the samples of both, and their gradients, are the means of those that each has alone."""
-    _, notes, _ = together
+    _, notes, *_ = together
     first, second = (each["average"]["good"] for each in notes)
     assert same(first["before"], second["before"]) and same(first["after"], second["after"])
     gradients, losses = [], []
@@ -261,7 +265,7 @@ def test_gradients_and_losses_are_those_of_all_samples(together):
 
 def test_bad_numbers_in_one_process_are_skipped_by_both(together):
     """Neither learns from a minibatch that is bad in one of them; nothing moves by a bit."""
-    _, notes, _ = together
+    _, notes, *_ = together
     for spoiled in (each["average"]["spoiled"] for each in notes):
         assert spoiled["report"]["skipped_updates"] == 1
         before = {key: value for key, value in spoiled["before"].items() if not key.startswith("adam")}
@@ -269,51 +273,20 @@ def test_bad_numbers_in_one_process_are_skipped_by_both(together):
         assert same(before, after)
 
 
-def test_two_machines_without_shared_files(together, tmp_path):
-    """Both go on from the first one's run, with the bits of two processes on one machine, one folder, one output."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    page = (ROOT / "docs" / "howto" / "cluster.md").read_text()
-    ours = {"--nproc_per_node": 1, "--master_addr": "127.0.0.1", "--master_port": port}
-    launches = []
-    for line in re.findall(r"^torchrun (.+) scripts/train.py", page, flags=re.MULTILINE):  # as they stand there
-        options = dict(word.split("=") for word in line.split())
-        assert ours.keys() < options.keys()
-        launches.append([f"{name}={value}" for name, value in (options | ours).items()])
-    runs = tmp_path / "0" / TASK
-    kept = shutil.copytree(together[0] / "kept", runs / "2026-01-01_00-00-00")
-    (tmp_path / "1").mkdir()
-    words = [
-        ROOT / "scripts" / "train.py",
-        f"--task={TASK}",
-        "--device=cpu",
-        "--logger=none",
-        "--verbose",
-        "--resume",
-    ]
-    words += [f"--max_iterations={FOREVER}", "--set=runner.save_interval=1"]
-    with contextlib.ExitStack() as stack:
-        first, second = (
-            stack.enter_context(torchrun(*words, f"--log_root={tmp_path / str(node)}", launch=launch))
-            for node, launch in enumerate(launches)
-        )
-        output = read_until(first, "Learning iteration 5/")
-        for process in (first, second):
-            process.send_signal(signal.SIGINT)
-        output += first.communicate(timeout=120)[0]
-        other = second.communicate(timeout=120)[0]
+def test_two_machines_without_shared_files(together):
+    """Both go on from the first one's run, with its bits, one folder, one output; they end with torchrun, and save."""
+    folder, _, output, other = together
     assert output.count(f"Training {TASK} on 2 x CPU") == output.count("Learning iteration 3/") == 1, output + other
     assert f"{2 * WORLDS} worlds" in output and "start anew" not in output
-    assert "Learning iteration" not in other and not list((tmp_path / "1").iterdir())
-    (resumed,) = (path for path in runs.iterdir() if path != kept)
+    assert "Learning iteration" not in other and not list((folder / "1").iterdir())
+    (resumed,) = (path for path in (folder / RUN).parent.iterdir() if path.name != RUN.name)
     assert output.count(f"The run is in {resumed}") == 1
     last = find_checkpoint(resumed, None)
     count = checkpoint_number(last)
-    assert count > 5 and torch.load(last, weights_only=True)["infos"]["total_timesteps"] == count * ALL_STEPS
+    assert count > 4 and torch.load(last, weights_only=True)["infos"]["total_timesteps"] == count * ALL_STEPS
     config = yaml.safe_load((resumed / "config.yaml").read_text())
     assert config["processes"] == 2 and config["env"]["env"]["num_envs"] == WORLDS
-    file = next((together[0] / "logs").glob("*/model_3.pt"))
+    file = next((folder / "logs").glob("*/model_3.pt"))
     one, twin = (dict(values(torch.load(path, weights_only=True))) for path in (file, resumed / file.name))
     assert not differences(one, twin)
 

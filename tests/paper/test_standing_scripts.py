@@ -9,7 +9,7 @@ from support.gravity import TASK
 from support.reports import line, write_run
 from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 
-CHECK = ["--device=cpu", "--num_envs=32", "--check_standing"]
+CHECK = ["--device=cpu", "--num_envs=8", "--check_standing"]
 
 
 def test_standing(made, tmp_path):

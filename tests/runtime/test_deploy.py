@@ -14,6 +14,7 @@ pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_t
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
+from legged_torque.runtime.brakes import Brakes
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
@@ -52,13 +53,13 @@ def exported(make_task, tmp_path_factory):
 
 def walk(transport, policy, ticks):
     """Stand up, then let the policy act."""
-    controller = Controller(policy, transport.joint_order, RATE)
+    controller = Controller(policy, transport.joint_order, RATE, Brakes(stand_up=1.0))
     meet(transport, controller)
     for tick in range(ticks):
         transport.send(controller.step(next_state(transport, controller), tick / RATE))
         if tick == 5:
             assert controller.request(Mode.STAND) == ""
-        if tick == round(3.2 * RATE):
+        if tick == round(1.2 * RATE):
             assert controller.request(Mode.POLICY) == ""
     return controller
 
@@ -85,7 +86,7 @@ def meet(transport, controller):
 
 def test_over_the_wire_as_in_process(exported, tmp_path):
     """A robot in another process ends where one in this process does; the wire rounds to float32."""
-    policy, ticks, xml = Policy(exported), round(3.3 * RATE), resource_path("resources/robots/go2/go2.xml")
+    policy, ticks, xml = Policy(exported), round(1.3 * RATE), resource_path("resources/robots/go2/go2.xml")
     command = [sys.executable, "-c", SIDE, str(DOMAIN), str(xml)]
     with (tmp_path / "said").open("w") as file, subprocess.Popen(command, stdout=file) as process:
         try:

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import warp
 from support.fused import assert_alike, compiled, put, step_fused, step_mujoco
 from support.on_device import assert_matches
 from support.published import read_robot
@@ -52,6 +53,12 @@ def touching(model, states):
         pairs = data.contact.geom.reshape(-1, 2)
         found.append([tuple(pair) for pair in pairs[(model.geom_bodyid[pairs] > 0).all(axis=1)].tolist()])
     return found
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    """No other test needs these kernels: half of the time to compile them, for few steps."""
+    monkeypatch.setattr(warp.config, "optimization_level", 0)
 
 
 @pytest.fixture(scope="module")

@@ -41,9 +41,10 @@ def test_tracking(share, falls_after, expected):
     assert measure.tracking(Box(share, falls_after)) == pytest.approx(expected, abs=0.003)
 
 
-def test_our_robot_walks():
+def test_our_robot_walks(monkeypatch):
     """A bundled policy tracks in plain MuJoCo as its card says of training's worlds, though yaw rates are halved."""
     folder = POLICIES_DIR / "go1" / "position"
+    monkeypatch.setattr(measure, "NUM_COMMANDS", 12)
     options = ours.Go1(folder, measure.EQUAL["iterations"]).model.opt
     assert options.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL and options.impratio == measure.EQUAL["impratio"]
     assert options.iterations == measure.EQUAL["iterations"]
@@ -53,14 +54,16 @@ def test_our_robot_walks():
 
 def test_our_side(tmp_path, monkeypatch):
     """A short training is timed and its checkpoint judged; iterations and steps per second are of the same time."""
-    words = {"settings": "equal", "engine": "fused", "num_envs": 2, "iterations": 10, "seed": 1, "device": "cpu"}
+    words = {"settings": "equal", "engine": "fused", "num_envs": 2, "iterations": 2, "seed": 1, "device": "cpu"}
     words |= {"started": 0.0, "out": tmp_path / "row.json"}
+    monkeypatch.setattr(measure, "INTERVAL", 2)
+    monkeypatch.setattr(measure, "NUM_COMMANDS", 2)
     monkeypatch.setattr(sys, "argv", ["ours", *(f"--{name}={value}" for name, value in words.items())])
     ours.main()
     row = json.loads((tmp_path / "row.json").read_text())
     assert row["training_steps_per_s"] * row["iteration_ms"] == pytest.approx(1e3 * 2 * 24)
     assert row["update_ms"] < row["iteration_ms"] < 1e3 * row["start_up_s"] and "seconds_to_70" not in row
-    assert [iterations for iterations, _, _ in row["tracking"]] == [10] and row["tracking"][0][2] < 0.3
+    assert [iterations for iterations, _, _ in row["tracking"]] == [2] and row["tracking"][0][2] < 0.3
     assert command.table([row | {"trainer": "a", "compared": "b", "engine": None}])[2].count("not reached") == 2
 
 
