@@ -153,6 +153,7 @@ def test_what_policies_bear(swept):
     words = "{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
     words += "the combination and {:.2f} under the curriculum"
     assert words.format(*pushed[[f"a1_{name}" for name in names]]) in text
+    assert f"curriculum; {pushed['a1_variable_stiffness']:.2f} under variable stiffness." in text
     both = pd.concat([swept.loc[trained, "push_velocity", "fell", 3.5] for trained in (BASE, f"{BASE} (earlier)")])
     both = {name: both[f"a1_{name}"] for name in names}
     p = dict(zip(names[1:], holm([welch(both[name], both["position"]) for name in names[1:]]), strict=True))
