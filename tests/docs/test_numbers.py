@@ -131,7 +131,7 @@ def test_hard_ranges():
     assert better["low", "track_xy"] == better["high", "track_xy"] == []
     change = {metric: mean[metric].unstack("task") for metric in ("track_angular", "cost_of_transport")}
     less = {metric: 1.0 - of.div(of["a1_position"], axis=0) for metric, of in change.items()}
-    assert f"exactly, by up to {less['track_angular'].to_numpy().max():.0%}, and" in text
+    assert f"exactly than PD, by up to {less['track_angular'].to_numpy().max():.0%}, and" in text
     assert [better[name, METRICS[-1]] for name in ("low", "high")] == 2 * [[combination]]
     saved = less["cost_of_transport"][combination]
     assert f"the combination needs {100 * saved['low']:.0f} and {saved['high']:.0%} less energy" in text
