@@ -177,6 +177,21 @@ def test_rough_ground(column):
         assert all(same(numbers[columns.index(name) - 1], value) for name, value in values.items()), (policy, values)
 
 
+def test_stairs():
+    """How many of the stairs up policies climb, by seed, and how many older ones failed."""
+    data = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.xz").query("environment == 'low'")
+    climbed = data[data["kind"] == "stairs_up"].groupby(["commit", "task", "seed"])["crossed"].mean()
+    text, of_task = text_of("results.md", "- In crossing"), climbed.drop("older").groupby("task")
+    low, *others = sorted(of_task.get_group("a1_rough_position"))
+    said = f"blind PD climbs {others[0]:.2f} to {others[-1]:.2f} of them in four seeds and {low:.2f} in one, the torque"
+    assert said in text and len(others) == 4
+    assert round(3 * of_task.min()["a1_rough_torque_curriculum_scan"], 1) == 2 and "with the scan two thirds." in text
+    assert climbed["older"].lt(0.755).sum() == 5 and len(climbed["older"]) == 16
+    assert "Of 16 older trainings, five climbed at most 0.75." in text
+    own = climbed[climbed.index.get_level_values("task").str.match("a1_rough_torque_multihead")]
+    assert own.min() >= 0.93 and "Torque multi-head climbed at least 0.93." in text
+
+
 def test_rough_ground_with_latency():
     """Tracking at the end of training, by seed, and shares of tiles."""
     data = pd.read_csv(DOCS / "results" / "rough" / "evaluations.csv.gz").query("steps > 246e6")

@@ -22,12 +22,11 @@ from legged_torque.utils.runs import checkpoint_numbers
 TABLES = yaml.safe_load(Path(__file__).with_name("mistakes.yaml").read_text("utf-8"))
 WATCHED = """
 import runpy, sys
-import torch
-from warp._src import context
 from legged_torque.experiments.local_launcher import LocalLauncher
 start = LocalLauncher.start
 def watched(*arguments):
-    print("initialized:", torch.cuda.is_initialized(), context.runtime, flush=True)
+    torch, context = map(sys.modules.get, ("torch", "warp._src.context"))
+    print("initialized:", bool(torch and torch.cuda.is_initialized()), context and context.runtime, flush=True)
     return start(*arguments)
 LocalLauncher.start = watched
 sys.argv = sys.argv[1:]
