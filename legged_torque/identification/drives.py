@@ -17,7 +17,7 @@ def asked(commands: Table, step: int, substeps: int, joint: int, pos: float, vel
 
 @wp.kernel(enable_backward=False)
 def drive(
-    step: int,
+    taken: wp.array2d(dtype=wp.int32),  # how many steps so far, (worlds, joints)
     substeps: int,  # physics steps per tick
     rate: float,  # physics steps per second
     joints: wp.array(dtype=wp.int32),  # places of the log's joints in the model
@@ -38,10 +38,12 @@ def drive(
     """
     world, place = wp.tid()
     joint = joints[place]
+    step = taken[world, place]
+    taken[world, place] = step + 1
     pos = qpos[world, 7 + joint] - candidates[world, BIAS, place]
     vel = 1.5 * qvel[world, 6 + joint] - 0.5 * past[world, place]
     past[world, place] = qvel[world, 6 + joint]
-    if step % substeps == 0:
+    if step % substeps == 0 and step / substeps < seen.shape[0]:
         seen[step / substeps, world, 0, place] = pos
         seen[step / substeps, world, 1, place] = vel
     late = rate * candidates[world, DELAY, place] + 0.5

@@ -1,5 +1,6 @@
 """Candidates as worlds of the fused engine: robots whose trunk is held, under the commands of a log."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ from legged_torque.envs.base.asset import load_asset
 from legged_torque.identification.drives import drive
 from legged_torque.identification.recording import Recording
 from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.graph import CudaGraph
 from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import refuse, unknown_name
 from legged_torque.utils.mjcf import hang_up
 
 STEP = 1e-3  # [s] longest physics step
+TICKS = 20  # of the log that are simulated as one CUDA graph
 FIELDS = {"armature": "dof_armature", "viscous_friction": "dof_damping", "coulomb_friction": "dof_frictionloss"}
 PARAMETERS = (*FIELDS, "bias", "delay")
 """Of a joint, as PACE has them [kg m^2, N m s/rad, N m, rad, s]; it stands where the encoder says, plus the bias."""
@@ -57,6 +60,11 @@ class HangingRobots:
         self._fields = [self._engine.field(field, range(6, model.nv)) for field in FIELDS.values()]
         tables = (recording.commands, self.torque_limits, [0.0, 0.0, 1.0, *recording.quaternion])
         self._tables = [torch.tensor(order, dtype=torch.int32, device=device), *map(self._tensor, tables)]
+        shape = (self.num_worlds, len(order))
+        self._taken = torch.zeros(shape, dtype=torch.int32, device=device)
+        self._values, self._past = (torch.zeros(*size, device=device) for size in ((shape[0], 5, shape[1]), shape))
+        self._seen = torch.zeros(len(recording.commands), shape[0], 2, shape[1], device=device)
+        self._graph = CudaGraph(self._run_ticks, device)
 
     def _tensor(self, values: Any) -> Tensor:
         """Return numbers on the device, as float32."""
@@ -70,24 +78,30 @@ class HangingRobots:
             ticks: How many ticks, at most those of the log.
 
         Returns:
-            Positions [rad] and velocities [rad/s] at the start of each tick. Shape: (ticks, num_worlds, 2, joints).
+            Positions [rad] and velocities [rad/s] at the start of each tick, which the next call overwrites. Shape:
+            (ticks, num_worlds, 2, joints).
         """
         engine, order, model = self._engine, self._order, self._engine.mj_model
-        values, start = self._tensor(parameters), self._tensor(self._recording.measured[0])
-        everywhere = torch.ones(self.num_worlds, dtype=torch.bool, device=engine.device)
+        start, everywhere = self._tensor(self._recording.measured[0]), self._taken[:, 0] >= 0
+        self._values.copy_(self._tensor(parameters))
+        self._past.copy_(start[1].expand_as(self._past))
+        self._taken.zero_()
         engine.reset(everywhere)
         for number, field in enumerate(self._fields):
-            field[:, 6:][:, order] = values[:, number]
+            field[:, 6:][:, order] = self._values[:, number]
         engine.update_constants(everywhere)
-        past = start[1].repeat(self.num_worlds, 1)
-        engine.qpos[:, 7:][:, order], engine.qvel[:, 6:][:, order] = start[0] + values[:, 3], past
+        engine.qpos[:, 7:][:, order], engine.qvel[:, 6:][:, order] = start[0] + self._values[:, 3], self._past
         engine.applied_forces()[0][:, 1, :3] = self._tensor(-model.body_mass[1] * model.opt.gravity)
-        seen = torch.empty(ticks, *past.shape[:1], 2, len(order), device=engine.device)
-        tensors = [*self._tables, values, past, engine.qpos, engine.qvel, engine.ctrl, seen]
-        inputs = [0, self._substeps, 1.0 / self._step, *map(wp.from_torch, tensors)]
-        launch = wp.launch(drive, past.shape, inputs, device=engine.device, record_cmd=True)
-        for step in range(ticks * self._substeps):
-            launch.set_param_by_name("step", step)
+        for _ in range(math.ceil(ticks / TICKS)):
+            self._graph()
+        return self._seen[:ticks]
+
+    def _run_ticks(self) -> None:
+        """Simulate some ticks; what encoders say is kept up to the end of the log."""
+        engine = self._engine
+        tensors = [*self._tables, self._values, self._past, engine.qpos, engine.qvel, engine.ctrl, self._seen]
+        inputs = [wp.from_torch(self._taken), self._substeps, 1.0 / self._step, *map(wp.from_torch, tensors)]
+        launch = wp.launch(drive, self._past.shape, inputs, device=engine.device, record_cmd=True)
+        for _ in range(TICKS * self._substeps):
             launch.launch()
             engine.step(sense=False)
-        return seen
