@@ -4,15 +4,54 @@ import hashlib
 import io
 import pickle
 import warnings
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import is_whole_archive, write_whole
 from legged_torque.utils.limits import NotNegative, Number, check_value
+
+
+class Background:
+    """A thread that writes while training goes on, one piece of work after the other.
+
+    What Python has begun there is finished even if the training is interrupted.
+    """
+
+    def __init__(self) -> None:
+        """Prepare; nothing runs yet."""
+        self._pool = ThreadPoolExecutor(1)
+        self._work: Future[None] | None = None
+        self._then: Callable[[], object] = lambda: None
+
+    def start(self, work: Callable[[], None], then: Callable[[], object]) -> None:
+        """Begin a piece of work after the one before; ``then`` is called by :meth:`poll` when it is done."""
+        self.finish()
+        self._work, self._then = self._pool.submit(work), then
+
+    def poll(self) -> None:
+        """Call what follows the work if that is done; an error of the work is raised here."""
+        if self._work and self._work.done():
+            work, self._work = self._work, None
+            work.result()
+            self._then()
+
+    def finish(self) -> None:
+        """Wait for the work, and do as :meth:`poll` does."""
+        if self._work:
+            wait([self._work])
+            self.poll()
+
+
+def on_host(content: Any) -> Any:
+    """Return nested containers with copies of all tensors, in the memory of the host."""
+    return tree_map_only(Tensor, lambda tensor: tensor.detach().to("cpu", copy=True), content)
 
 
 def write(file: Path, content: dict[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """The training loop, for any learner and task with the members of :mod:`~legged_torque.learning.protocols`."""
 
+import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +21,7 @@ from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import TrainingError, UserError
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.utils.runs import checkpoint_file, claim_run_dir, evaluations_file, tagged
+from legged_torque.utils.runs import checkpoint_file, checkpoint_number, claim_run_dir, evaluations_file, tagged
 from legged_torque.utils.stopwatch import stopwatch
 
 LAST_SHARE = 0.25
@@ -76,6 +77,7 @@ class Trainer:
         self._saved_iteration = -1
         self._has_old_worlds = False  # whether the worlds are those of a checkpoint
         self._log = TrainingLog(env, logger, cfg)
+        self._background = checkpoint.Background()
         self._worlds = Worlds(env, alg, cfg["evaluation"], [*self._evaluators, self._log])
 
     @property
@@ -103,13 +105,15 @@ class Trainer:
         first, last = self.current_learning_iteration, self.current_learning_iteration + num_learning_iterations
         guard = TrainingGuard(self.env.health)
         self._log.start(first, last, self.verbose)
-        self.save_checkpoint()  # the viewer shows it while the first iterations run
+        self.save_checkpoint()
+        self._background.finish()  # the viewer shows it while the first iterations run
         notify = self._log.display.notify if distributed.rank() == 0 else lambda text: None
         with self._log.display, StopRequest(notify) as stop:
             while self.current_learning_iteration < last and not guard.problem:
                 asked = stop.requested or self._log.broken_pipe is not None or distributed.has_lost_parent()
                 if distributed.any_process(asked, self.device):
                     break
+                self._background.poll()
                 begin, stage = time.perf_counter(), "" if self.current_learning_iteration > first else "first iteration"
                 self.collect_rollout()
                 self._log.write()  # of the last iteration, while the device is busy with this one
@@ -128,6 +132,7 @@ class Trainer:
                     self.save_checkpoint()
                 stopwatch.lap("logs and checkpoints")
             self.save_checkpoint()  # writes the last log too
+            self._background.finish()
         self.stopped_by = stop.number
         if self._log.broken_pipe:
             raise self._log.broken_pipe
@@ -188,36 +193,55 @@ class Trainer:
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def save_checkpoint(self) -> None:
-        """Save into the run's folder, with all that was logged, and warn if the simulation has dropped contacts."""
+        """Save into the run's folder, with all that was logged, and warn if the simulation has dropped contacts.
+
+        What is saved is that of now; files are written while training goes on.
+        """
         self._log.write()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
             file = checkpoint_file(Path(self.log_dir), self.current_learning_iteration)
-            digest = self._worlds.write(file)
-            self.save(str(file), {"worlds": digest})
+            processes, state = self._worlds.gather(), checkpoint.on_host(self._state({}))
             self._saved_iteration = self.current_learning_iteration
-            if digest:
-                remove_other_worlds(file)
-            if self.on_checkpoint:
-                self.on_checkpoint(file)
+            if distributed.rank() == 0:
+                work = functools.partial(self._write, file, processes, state)
+                self._background.start(work, functools.partial(self._announce, file))
         warning = self.env.check_buffers()
         if warning:
             warn(warning)
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Save what training needs to continue, and ``infos``; all processes that train together call it."""
+        state = self._state(infos or {})
+        if distributed.rank() == 0:
+            checkpoint.write(Path(path), state)
+            self.logger.save_model(path, self.current_learning_iteration)
+
+    def _state(self, infos: dict) -> dict[str, Any]:
+        """Return the content of a checkpoint with these infos, plain values and tensors."""
         state = self.alg.state_dict()
         state["iter"] = self.current_learning_iteration
         state["infos"] = {
-            **(infos or {}),  # plain values and tensors
+            **infos,
             "task": self.env.state_dict(),
             "task_name": self.cfg.get("task"),
             "total_timesteps": self.logger.tot_timesteps,
             "seconds": self._seconds_before + self.logger.tot_time,
             "random_states": distributed.gather(random_state(self.device)),
         }
-        if distributed.rank() == 0:
-            checkpoint.write(Path(path), state)
-            self.logger.save_model(path, self.current_learning_iteration)
+        return state
+
+    def _write(self, file: Path, processes: list[dict[str, Any]], state: dict[str, Any]) -> None:
+        """Write the worlds of all processes, and then the checkpoint that they belong to."""
+        state["infos"]["worlds"] = digest = self._worlds.write(file, processes)
+        checkpoint.write(file, state)
+        if digest:
+            remove_other_worlds(file)
+
+    def _announce(self, file: Path) -> None:
+        """Tell others that a checkpoint has been written."""
+        self.logger.save_model(str(file), checkpoint_number(file))
+        if self.on_checkpoint:
+            self.on_checkpoint(file)
 
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None

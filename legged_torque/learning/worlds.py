@@ -8,9 +8,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-from torch.utils._pytree import tree_map
-
 from legged_torque.learning import checkpoint
 from legged_torque.learning.protocols import Stateful
 from legged_torque.utils import distributed
@@ -27,19 +24,24 @@ class Worlds:
         self._owners = {"worlds": task} | ({"learner": learner} if hasattr(learner, "world_state_dict") else {})
         self._evaluation = {key: evaluation[key] for key in ("num_envs", "perturbation")}
 
-    def write(self, checkpoint_file: Path) -> str:
-        """Write the worlds of all processes, before the checkpoint that they belong to, and return their digest.
+    def gather(self) -> list[dict[str, Any]]:
+        """Return the worlds of all processes in the first one, copied to the host; nothing in the others.
 
-        Empty in all processes but the first, and where worlds cannot be kept: the checkpoint is worth more.
+        Nothing, too, of a task that cannot keep its worlds.
         """
         if not hasattr(self._task, "identity"):
-            return ""
+            return []
         state = {name: owner.world_state_dict() for name, owner in self._owners.items()}
         for other in self._others:
             state |= other.state_dict()
-        copies = tree_map(lambda value: value.detach().cpu().clone() if isinstance(value, Tensor) else value, state)
-        processes = distributed.gather(copies)
-        if distributed.rank() > 0:
+        return [checkpoint.on_host(each) for each in distributed.gather_tensors(state, self._task.device)]
+
+    def write(self, checkpoint_file: Path, processes: list[dict[str, Any]]) -> str:
+        """Write what :meth:`gather` returned, before the checkpoint that it belongs to, and return its digest.
+
+        Empty where worlds cannot be kept: the checkpoint is worth more.
+        """
+        if not processes:
             return ""
         try:
             content = {"identity": json.dumps(self._identity()), "processes": processes}

@@ -26,6 +26,7 @@ ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)}, 0, 0, 0)  # PR_SET_PDEATHSIG o
 os.execvp(sys.argv[1], sys.argv[1:])
 """
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
+_WORD = 8  # bytes: tensors that travel together begin at its multiples, as any type of numbers must
 _shared: SharedMean | None = None  # of processes that this module has started, once they have found each other
 
 
@@ -160,6 +161,40 @@ def gather(value: Any) -> list[Any]:
     values: list[Any] = [None] * torch.distributed.get_world_size()
     torch.distributed.all_gather_object(values, value)
     return values
+
+
+def gather_tensors(content: Any, device: str) -> list[Any]:
+    """Return nested containers of all processes, in their order, in the first one; nothing in the others.
+
+    Tensors travel in one piece between devices ("cpu", "cuda:N"), and stay there. Containers and shapes may differ.
+    """
+    import torch
+    from torch.utils._pytree import tree_leaves, tree_map_only
+
+    if not torch.distributed.is_initialized():
+        return [content]
+    shapes = gather(tree_map_only(torch.Tensor, lambda tensor: tensor.to("meta"), content))
+    tensors = [[leaf for leaf in tree_leaves(each) if torch.is_tensor(leaf)] for each in shapes]
+    sizes = [[tensor.nbytes + -tensor.nbytes % _WORD for tensor in of_process] for of_process in tensors]
+    flat = torch.zeros(max(map(sum, sizes)), dtype=torch.uint8, device=device)
+    parts = [torch.empty_like(flat) for _ in shapes] if rank() == 0 else []
+
+    def views(of: int, part: Tensor) -> list[Tensor]:
+        """Return the places of a process's tensors in its part."""
+        pieces = zip(part[: sum(sizes[of])].split(sizes[of]), tensors[of], strict=True)
+        return [piece[: leaf.nbytes].view(leaf.dtype).view(leaf.shape) for piece, leaf in pieces]
+
+    mine = [leaf for leaf in tree_leaves(content) if torch.is_tensor(leaf)]
+    for view, tensor in zip(views(rank(), flat), mine, strict=True):
+        view.copy_(tensor)
+    torch.distributed.gather(flat, parts or None)
+
+    def filled(of: int, part: Tensor) -> Any:
+        """Return the containers of a process with its tensors."""
+        own = iter(views(of, part))
+        return tree_map_only(torch.Tensor, lambda _: next(own), shapes[of])
+
+    return [filled(*each) for each in enumerate(parts)]
 
 
 def from_first(value: Any, device: str) -> Any:
