@@ -254,8 +254,8 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
             "ends_on_contact_of": list(asset.terminate_after_contacts_on) if cfg.terminations.contact else [],
         },
     }
-    if task.power.has_losses:
-        description["copper_loss"] = _by_joint(task, task.power.copper_loss)
+    if task.meter.has_losses:
+        description["copper_loss"] = _by_joint(task, task.meter.copper_loss)
     if latency := _latency(task, description["motors"]):
         description["latency"] = latency
     if others := _not_simulated(task):

@@ -77,6 +77,7 @@ class Simulation:
         self.has_losses = bool(self._copper_loss.any())
         self.command, self._power = np.zeros(3), np.zeros(3)
         self._last_torques: np.ndarray | None = None  # of the episode
+        self._peak_force = 0.0
         self._steps = 0
 
     def run(self, num_steps: int, seed: Any, on_step: Callable[[], None] = lambda: None) -> np.ndarray:
@@ -125,6 +126,7 @@ class Simulation:
             power = np.abs(applied * robot.joint_velocities()).sum(), applied**2 @ self._copper_loss
             change = 0.0 if self._last_torques is None else np.abs(applied - self._last_torques).mean()
             self._power += *power, change
+            self._peak_force = max(self._peak_force, robot.contact_force())
             self._last_torques = applied
             self._now += 1
             if is_late:
@@ -137,7 +139,7 @@ class Simulation:
         robot = self.robot
         fell = robot.has_fallen()
         ended = fell or self._steps >= self._max_steps
-        force = robot.contact_force()
+        force, peak = robot.contact_force(), self._peak_force
         if ended:
             self._new_episode()
         elif self._rng.random() < self._commands["resampling_probability"]:
@@ -146,7 +148,7 @@ class Simulation:
             self._push()
         self._follow_heading()
         velocity = robot.planar_velocity()
-        numbers = (np.linalg.norm(velocity[:2]), force, *self._power, robot.height(), fell, ended)
+        numbers = (np.linalg.norm(velocity[:2]), force, *self._power, robot.height(), fell, ended, peak)
         arrays = [command[None], velocity[None], *(np.array([number]) for number in numbers)]
         return step_sums(np, *arrays, tracked=2 if "heading" in self._commands else 3)[:, 0]
 
@@ -171,7 +173,7 @@ class Simulation:
         self._draw_command()
         self._heights.clear()
         self._steps = self._now = 0
-        self._last_torques = None
+        self._last_torques, self._peak_force = None, 0.0
         self._actions.restart(self._rng, self.policy.last_action.copy())
         self._measurements.restart(self._rng, self._measured())
 

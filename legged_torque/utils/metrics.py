@@ -9,6 +9,7 @@ world was reset are left out, but for the count of falls.
 - collision_force: mean of the sum over geoms of the norm of the ground's force, in the last physics step of a
   control step [N]. A robot that stands still has its weight, 122 N for the A1, and a little more where its feet
   push sideways: 127 N in the nominal pose.
+- peak_force: mean over episodes that ended of the largest sum over geoms in any of their physics steps [N].
 - mechanical_power: mean of sum |tau_i qd_i| over all physics steps [W], tau_i being what a motor makes before its own
   friction. cost_of_transport: this mean over m g times mean horizontal speed, with the nominal m g.
 - electrical_power, electrical_cost: the same with copper losses, mean of sum |tau_i qd_i| + c_i tau_i^2 [W], if
@@ -35,6 +36,7 @@ UNITS = {
     "track_xy": "m^2/s^2",
     "track_angular": "rad^2/s^2",
     "collision_force": "N",
+    "peak_force": "N",
     "cost_of_transport": "",
     "mechanical_power": "W",
     "electrical_power": "W",
@@ -45,7 +47,7 @@ UNITS = {
     "falls_per_minute": "1/min",
 }
 """Units of the metrics, by their names in files and on the terminal; each has its formula in :func:`ratios`."""
-NUM_SUMS = 12  # numbers that step_sums returns for each world
+NUM_SUMS = 14  # numbers that step_sums returns for each world
 
 
 @dataclass
@@ -80,6 +82,7 @@ def step_sums(
     height: Array,
     fell: Array,
     ended: Array,
+    peak_force: Array,
     *,
     tracked: int = 3,
 ) -> Array:
@@ -97,20 +100,21 @@ def step_sums(
         height: Of the trunk's origin above the ground [m]. Shape: (worlds,).
         fell: Whether the episode ended with the step, but not by its time. Shape: (worlds,), bool.
         ended: Whether it ended at all; then nothing but the fall counts. Shape: (worlds,), bool.
+        peak_force: Largest force in the episode [N]. Shape: (worlds,).
         tracked: How many of the commands count for the tracking percentage: 2 if the yaw rate turns to a heading.
 
     Returns:
         Shape: (:data:`NUM_SUMS`, worlds): steps, tracking percentage, steps with a command, xy, angular, force, power,
-        copper, change of torque, height, speed, falls.
+        copper, change of torque, height, speed, falls, episodes that ended, their peaks of force.
     """
     error = abs(commands - velocity)
     percentage, is_commanded = tracking_percentage(xp, error[:, :tracked], commands[:, :tracked])
     one, zero = xp.ones_like(percentage), xp.zeros_like(percentage)
     xy, angular = (error[:, :2] ** 2).sum(axis=1), error[:, 2] ** 2
     moved = [power, copper, torque_change, height, speed]
-    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, *moved, zero])
+    rows = xp.stack([one, percentage, is_commanded, xy, angular, force, *moved, zero, zero, zero])
     rows = xp.where(ended, 0.0, rows)
-    rows[-1] = fell
+    rows[-3], rows[-2], rows[-1] = fell, ended, xp.where(ended, peak_force, 0.0)
     return rows
 
 
@@ -120,13 +124,14 @@ def ratios(sums: Array, weight: float, control_step: float, has_losses: bool) ->
     ``sums`` are those of :func:`step_sums`, ``weight`` is the robot's m g [N], and ``control_step`` is in seconds. A
     robot that ``has_losses`` has metrics of electrical power, too.
     """
-    steps, percentage, commanded, xy, angular, force, power, copper, change, height, speed, falls = sums
+    steps, percentage, commanded, xy, angular, force, power, copper, change, height, speed, falls, ends, peaks = sums
     electrical = {"electrical_power": (power + copper, steps), "electrical_cost": (power + copper, weight * speed)}
     return {
         "track_percentage": (percentage, commanded),
         "track_xy": (xy, steps),
         "track_angular": (angular, steps),
         "collision_force": (force, steps),
+        "peak_force": (peaks, ends),
         "cost_of_transport": (power, weight * speed),
         "mechanical_power": (power, steps),
         **(electrical if has_losses else {}),

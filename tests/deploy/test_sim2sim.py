@@ -180,11 +180,12 @@ def test_episodes_end(policy):
     simulation.run(0, 1)
     robot.reset(*random_state(1, height=0.03))
     simulation._control_step()
-    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 11 + [1.0]
+    *others, fell, ended, peak = simulation._finish_step(simulation.command)
+    assert (others, fell, ended) == ([0.0] * 11, 1.0, 1.0) and peak > simulation.robot.weight
     assert robot.position[2] == 0.4 and simulation._steps == 0 and (policy.last_action == 0).all()
     simulation._control_step()
     simulation._steps = 1000
-    assert simulation._finish_step(simulation.command).tolist() == [0.0] * 12
+    assert simulation._finish_step(simulation.command).tolist()[:13] == [0.0] * 12 + [1.0]
     assert simulation._steps == 0
 
 

@@ -50,7 +50,7 @@ def add(task, metrics, **step):
     """Write a step into the task's tensors, where they are left out as 0, and let the metrics add it."""
     places = {"lin_vel": task.base_lin_vel, "ang_vel": task.base_ang_vel, "torques": task.torques}
     places |= {"joint_vel": task.dof_vel, "height": task.base_pos[:, 2], "force": task.sim.contact_force}
-    steps = 4 * task.power.begin()  # of four physics steps, all alike
+    steps = 4 * task.meter.begin()  # of four physics steps, all alike
     places |= {"reset": task.reset_buf, "time_out": task.time_out_buf}
     for name, place in places.items():
         place.copy_(torch.as_tensor(step.get(name, 0)))
@@ -69,11 +69,15 @@ def follow(command, lin_vel, ang_vel):
 def sums_by_hand(steps, dt):
     """Numerator and denominator of every metric, one number per world, by a loop over worlds and steps."""
     count, worlds = steps["reset"].shape
-    result = {name: np.zeros((2, worlds)) for name in UNITS}
+    result, peaks = {name: np.zeros((2, worlds)) for name in UNITS}, np.zeros(worlds)
     for t in range(count):
         for w in range(worlds):
             now = {name: values[t, w].astype(float) for name, values in steps.items()}
+            force = sum(math.sqrt(f @ f) for f in now["force"])
+            peaks[w] = max(peaks[w], force)
             if now["reset"]:
+                result["peak_force"][:, w] += peaks[w], 1.0
+                peaks[w] = 0.0
                 result["falls_per_minute"][0, w] += not now["time_out"]
                 continue
             followed = follow(now["commands"], now["lin_vel"], now["ang_vel"])
@@ -88,7 +92,7 @@ def sums_by_hand(steps, dt):
             heat = sum(c * tau**2 for tau, c in zip(now["torques"], COPPER_OF_JOINTS, strict=True))
             result["track_xy"][:, w] += (vx - x) ** 2 + (vy - y) ** 2, 1.0
             result["track_angular"][:, w] += (yaw_rate - yaw) ** 2, 1.0
-            result["collision_force"][:, w] += sum(math.sqrt(f @ f) for f in now["force"]), 1.0
+            result["collision_force"][:, w] += force, 1.0
             result["cost_of_transport"][:, w] += power, WEIGHT * speed
             result["mechanical_power"][:, w] += power, 1.0
             result["electrical_cost"][:, w] += power + heat, WEIGHT * speed
@@ -172,6 +176,7 @@ def test_lying_robots_against_mujoco(make_task):
             touching[w] |= found > 0
     force, steps = metrics.ratios()["collision_force"]
     assert steps.tolist() == [150.0] * 3
+    np.testing.assert_allclose(task.meter.peak_force, expected.max(axis=0), rtol=2e-3)
     np.testing.assert_allclose(force / steps, expected.mean(axis=0), rtol=2e-3)
     assert (touching.sum(axis=1) >= 4).all() and touching[:, 0].any()
 
@@ -272,10 +277,10 @@ def test_arrays_and_tensors_give_the_same():
     generator = torch.Generator().manual_seed(5)
     commands, velocity = (torch.randn(50, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     commands[:10, 1], commands[10:20] = 0.0, 0.0
-    parts = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(6)]
+    *parts, peak = [torch.rand(50, generator=generator, dtype=torch.float64) for _ in range(7)]
     ended = torch.arange(50) % 7 == 0
     fell = ended & (torch.arange(50) % 2 == 0)
-    batch = step_sums(torch, commands, velocity, *parts, fell, ended).numpy()
+    batch = step_sums(torch, commands, velocity, *parts, fell, ended, peak).numpy()
     for world in range(50):
-        rows = (tensor[world : world + 1].numpy() for tensor in (commands, velocity, *parts, fell, ended))
+        rows = (tensor[world : world + 1].numpy() for tensor in (commands, velocity, *parts, fell, ended, peak))
         np.testing.assert_allclose(step_sums(np, *rows)[:, 0], batch[:, world], rtol=1e-12)

@@ -13,8 +13,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.evaluation import WalkingEvaluation
-from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.state import RobotState
+from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.sim.compiled import compiled
 from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
@@ -33,7 +33,7 @@ class BaseTask(VecEnv):
 
     Attributes:
         state: The state of the robots.
-        power: What their motors draw, see :meth:`measure_power`.
+        meter: What :meth:`measure_steps` measures: power of their motors, peaks of contact forces.
         obs_buf: Groups of observations: "policy" and "critic", each (num_envs, size), and others of a task's own.
         rew_buf: Rewards of the last step. Shape: (num_envs,).
         total_steps: Environment steps so far over all worlds of all processes: t of eq. 1. Scalar, int64.
@@ -47,7 +47,7 @@ class BaseTask(VecEnv):
     sim: Engine
     terrain: Terrain
     state: RobotState
-    power: PowerMeter
+    meter: StepMeter
     obs_buf: TensorDict
     num_processes = 1
     _parts: Sequence[Callable[[], None]] = ()
@@ -133,9 +133,9 @@ class BaseTask(VecEnv):
         self._keeps_final, self._final = value, {}
         self.step_graph.reset()
 
-    def measure_power(self) -> None:
-        """Let :attr:`power` measure all steps from now on; the step is captured anew."""
-        self.power.is_on = True
+    def measure_steps(self) -> None:
+        """Let :attr:`meter` measure all steps from now on; the step is captured anew."""
+        self.meter.is_on = True
         self.step_graph.reset()
 
     @property

@@ -15,7 +15,6 @@ from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
-from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.random_events import RandomEvents
 from legged_torque.envs.base.random_parameters import (
     control_parameters,
@@ -30,6 +29,7 @@ from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
 from legged_torque.envs.base.robot_checks import range_notes
 from legged_torque.envs.base.state import RobotState, StateAccess
+from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.terminations import Terminations
@@ -170,7 +170,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         """Do the physics steps of a control step, with torques of one kernel where that is possible."""
         self.motors.send(self.actions)
         decimation, pos, vel = self.cfg.control.decimation, self.dof_pos, self.dof_vel
-        after_step = self.power.begin() + self.sensors.begin_step()
+        after_step = self.meter.begin() + self.sensors.begin_step()
         for i in range(decimation):
             if self._torque_kernel and not self._is_overridden():
                 self._torque_kernel.launch(i)
@@ -178,7 +178,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
                 if i == 0 or self.cfg.control.refresh_torques:
                     wanted = self._compute_torques(self.motors.actions(pos, vel, i))
                 self.torques.copy_(self.motors.apply(wanted, pos, vel, i))
-            self.sim.step(sense=i == decimation - 1)
+            self.sim.step(sense=i == decimation - 1 or self.meter.is_on)
             for look in after_step:
                 look()
 
@@ -342,7 +342,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         targets = (control.default_dof_pos, (control.p_gains, control.d_gains))
         self.motors = MotorChain(cfg.motors, Joints(*constants, self.actions, *clock, *targets))
         self.motor_strength = self.motors.strength
-        self.power = PowerMeter(self.state, self.motors, cfg.control, self.dof_names)
+        self.meter = StepMeter(self.state, self.motors, cfg.control, self.dof_names)
         self._torque_kernel = None
         if cfg.control.refresh_torques:
             self._torque_kernel = self.motors.kernel(self.control_law.kernel, self.dof_pos, self.dof_vel, self.torques)

@@ -7,8 +7,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_torque.envs.base.power import PowerMeter
 from legged_torque.envs.base.state import RobotState
+from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.sim.engine import Engine
 from legged_torque.utils import metrics
 from legged_torque.utils.display import Counter
@@ -23,13 +23,13 @@ class WalkingTask(Protocol):
     cfg: Any
     sim: Engine
     state: RobotState
-    power: PowerMeter
+    meter: StepMeter
     num_envs: int
     device: str
     dt: float
 
-    def measure_power(self) -> None:
-        """Let ``power`` measure all steps from now on."""
+    def measure_steps(self) -> None:
+        """Let ``meter`` measure all steps from now on."""
 
     def reset(self) -> TensorDict:
         """Start a new episode in every world, and return the observations."""
@@ -44,7 +44,7 @@ class WalkingMetrics:
     def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
-        task.measure_power()
+        task.measure_steps()
         model = task.sim.mj_model
         self.weight = float(model.body_mass.sum()) * abs(float(model.opt.gravity[2]))
         self._sums = torch.zeros(metrics.NUM_SUMS, task.num_envs, device=task.device)
@@ -58,7 +58,7 @@ class WalkingMetrics:
 
         Only in the worlds that are ``counted``, if it is given. Shape: (num_envs,), bool.
         """
-        state, power = self._task.state, self._task.power
+        state, meter = self._task.state, self._task.meter
         velocity = state.planar_velocity()
         sums = metrics.step_sums(
             torch,
@@ -66,12 +66,13 @@ class WalkingMetrics:
             velocity,
             speed=velocity[:, :2].norm(dim=1),
             force=state.contact_force.norm(dim=2).sum(dim=1),
-            power=power.mechanical,
-            copper=power.copper,
-            torque_change=power.torque_change,
+            power=meter.mechanical,
+            copper=meter.copper,
+            torque_change=meter.torque_change,
             height=state.base_height,
             fell=state.reset_buf & ~state.time_out_buf,
             ended=state.reset_buf,
+            peak_force=meter.peak_force,
             tracked=num_tracked(self._task),
         )
         self._sums += sums if counted is None else sums * counted
@@ -93,7 +94,7 @@ class WalkingMetrics:
 
     def _ratios(self, sums: Any) -> dict[str, tuple[Any, Any]]:
         """Return the ratios of sums, which are a tensor or an array."""
-        return metrics.ratios(sums, self.weight, self._task.dt, self._task.power.has_losses)
+        return metrics.ratios(sums, self.weight, self._task.dt, self._task.meter.has_losses)
 
 
 class CommandBreakdown:
