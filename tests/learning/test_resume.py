@@ -210,7 +210,7 @@ def test_what_killed_processes_have_left_is_removed(copied):
 
 
 def test_files_that_cannot_be_written(tmp_path, capsys):
-    """Training goes on without curves, evaluations and worlds, and leaves its checkpoint; a line each says so."""
+    """Training goes on without curves, evaluations and worlds; a line each says so. Without checkpoints it ends."""
 
     class Writer:
         """Fails from the first number on."""
@@ -233,3 +233,7 @@ def test_files_that_cannot_be_written(tmp_path, capsys):
     assert files == {"model_0.pt", "model_1.pt", "worlds_1.pt", "model_2.pt"}  # the last worlds stay with theirs
     start(None, "--resume", f"--load_run={runner.log_dir}")
     assert "The worlds start anew" in capsys.readouterr().out
+    (folder / "model_3.pt").mkdir()
+    runner.cfg["save_interval"] = 1
+    assert f"cannot write '{folder / 'model_3.pt'}" in error_of(runner.learn, 100)
+    assert runner.current_learning_iteration in (3, 4)  # it is told soon, while the thread writes the next one

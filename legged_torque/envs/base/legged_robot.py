@@ -294,8 +294,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def world_state_dict(self) -> dict[str, Any]:
         """Return all that worlds keep from step to step, by owner."""
         owners: dict[str, Any] = {"sim": self.sim, "state": self.state, "rewards": self.rewards, "log": self.log}
-        owners |= {"motors": self.motors, "events": self.events, "commands": self.command_generator}
-        owners |= {"terrain": self.terrain, "observations": self.observations, "sensors": self.sensors}
+        owners |= {"motors": self.motors, "meter": self.meter, "events": self.events, "sensors": self.sensors}
+        owners |= {"commands": self.command_generator, "terrain": self.terrain, "observations": self.observations}
         return {name: owner.state_dict() for name, owner in owners.items()} | {"task": self._world_state}
 
     # ---- construction, in this order ---------------------------------------------------------------------------------

@@ -54,6 +54,10 @@ class StepMeter:
         self._last_torques.copy_(self._motors.before_friction(self._state.torques))
         return [self._add_step]
 
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return what is kept from control step to control step."""
+        return {"peak_force": self.peak_force}
+
     def _add_step(self) -> None:
         """Add the physics step that has just been made."""
         torques, vel = self._motors.before_friction(self._state.torques), self._state.dof_vel
