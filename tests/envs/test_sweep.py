@@ -78,7 +78,7 @@ def test_parts(make_task, name, setting, ends, tensor):
 
 def test_pushes(make_task):
     """Who lies down after a push has fallen; who was at rest has not; impulses are of the whole robot."""
-    task = make_task("a1_position", 64, **{f"domain_rand.{PUSH}": [-8.0, 8.0], "domain_rand.push_robots": False})
+    task = make_task("a1_position", 32, **{f"domain_rand.{PUSH}": [-8.0, 8.0], "domain_rand.push_robots": False})
     pushes, steps = PushSweep(task), round((REST + WATCHED) / task.dt)
     speeds = []
 
@@ -87,13 +87,13 @@ def test_pushes(make_task):
         pushes.add_step(commands)
         speeds.append((task.sim.qvel[:, :2] - before).norm(dim=1))
 
-    measure(task, lambda obs: torch.zeros(64, task.num_actions), 2 * steps, on_step)  # PD holds the nominal pose
+    measure(task, lambda obs: torch.zeros(32, task.num_actions), 2 * steps, on_step)  # PD holds the nominal pose
     pushed = torch.stack(speeds)
     when = pushed.any(dim=1).nonzero()[:, 0].tolist()
     assert when == [round(REST / task.dt), round(REST / task.dt) + steps]
     table, mass = pushes.table(), task.sim.mj_model.body_mass.sum()
     counts = np.histogram(pushed[when].numpy(), np.linspace(0.0, 8.0, NUM_PARTS + 1))[0]
-    assert [part["pushes"] for part in table] == counts.tolist() and counts.sum() == 128
+    assert [part["pushes"] for part in table] == counts.tolist() and counts.sum() == 64
     assert table[1]["impulse"] == pytest.approx([1.0 * mass, 2.0 * mass], rel=1e-5)
     assert table[0]["fell"]["mean"] == 0.0 and table[-1]["fell"]["mean"] > 0.5
 
@@ -101,11 +101,7 @@ def test_pushes(make_task):
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        (
-            "motor_strength",
-            {"domain_rand.motor_strength": {}},
-            "motor_strength is always 1: give domain_rand.",
-        ),
+        ("motor_strength", {"domain_rand.motor_strength": {}}, "motor_strength is always 1: give domain_rand."),
         ("action_delay", {}, "action_delay is always 0: give motors.delay.range"),
         ("foot_pos", {}, "foot_pos has 12"),
     ],

@@ -34,7 +34,7 @@ def test_the_trunk_is_fixed(leg):
 def found(leg, tmp_path_factory):
     """What identify.py finds in a noisy log of drives with loops of 5 kHz; what it prints, and its settings."""
     folder, (kind, _, training) = tmp_path_factory.mktemp("found"), task_registry._tasks["go2_torque"]
-    write_log(folder / "chirp.mcap", noisy(record(leg, sweep(8.0), step=2e-4)), "one_leg")
+    write_log(folder / "chirp.mcap", noisy(record(leg, sweep(6.0), step=2e-4)), "one_leg")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(task_registry._tasks, "one_leg", (kind, leg, training))
         patch.setattr(fit, "GENERATIONS", 2)

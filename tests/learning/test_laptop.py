@@ -28,13 +28,7 @@ TWO_CORES = pytest.mark.skipif(sys.platform != "linux" or len(os.sched_getaffini
 
 
 def end_first_of_two(number, line, *command):
-    """Send the first of two processes a signal after a line; return its status, and the output until both have ended.
-
-    Args:
-        number: The signal.
-        line: How the line begins.
-        command: The script and its words.
-    """
+    """Send the first of two processes a signal after a line that begins so; return its status, and all output."""
     how = {"env": os.environ | PATHS | {"OMP_NUM_THREADS": "2"}, "text": True, "stderr": subprocess.STDOUT}
     output, others = "", []
     with subprocess.Popen([*COMMAND, *command], stdout=subprocess.PIPE, **how) as process:

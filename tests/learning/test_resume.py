@@ -60,7 +60,7 @@ OTHERS = {
 OTHERS["two rates"] = ["--task=a1_multihead_two_rates", "--set=runner.num_steps_per_env=3"]  # ends within intervals
 OTHERS["two rates"] += ["--set=env.history_length=1", "--set=evaluation.interval=0"]
 OTHERS["hard"] += ["--set=evaluation.interval=1000"]  # evaluated at the ends
-OTHERS["rough"] += ["--set=terrain.max_init_terrain_level=2", "--set=terrain.border_size=1"]
+OTHERS["rough"] += ["--set=terrain.max_init_terrain_level=2", "--set=terrain.border_size=1", OTHERS["hard"][-1]]
 OTHERS["rough"] += ["--set=motors.delay.unit=control_steps", "--set=control.refresh_torques=false"]  # a shared kernel
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from support.rollouts import POISONS, SIZES, make_ppo, parameters, poison, record_rollout, steps_taken
 from support.runners import build_runner, networks
-from support.wide_ppo import assert_steps_are_those_of_torch, build, choose
+from support.wide_ppo import NARROW, assert_steps_are_those_of_torch, build, choose
 
 from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels
 from legged_torque.learning.ppo.cpu_ppo import CpuPPO
@@ -88,7 +88,7 @@ def test_steps_are_those_of_torch(optimizer):
 
 def test_learning_rate_follows_the_divergence():
     """As without fused kernels: after the policy has moved far, it falls by 1.5, annealed too, and its bounds hold."""
-    algorithms = pair(schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
+    algorithms = pair(sizes=NARROW, schedule="adaptive", learning_rate=1e-2, desired_kl=0.01, annealing_start=0.5)
     for progress in (1, 3):
         choose(algorithms, progress)
         for alg in algorithms:
@@ -109,7 +109,7 @@ def learn(alg, firsts):
 @pytest.mark.parametrize(("field", "value"), POISONS[5:6])
 def test_a_minibatch_that_is_skipped_leaves_nothing_behind(field, value):
     """It is counted, and the next one is learned from as if the one before had never been, to the bit."""
-    spoiled, twin = make(), make()
+    spoiled, twin = make(sizes=NARROW), make(sizes=NARROW)
     record_rollout(spoiled)
     record_rollout(twin)
     learn(twin, [60])
@@ -121,7 +121,7 @@ def test_a_minibatch_that_is_skipped_leaves_nothing_behind(field, value):
 
 def test_the_critic_learns_alone():
     """While a pre-trained policy stays, only the critic's parameters move."""
-    alg = make()
+    alg = make(sizes=NARROW)
     record_rollout(alg)
     alg.warm_up_iterations = 1
     alg.set_progress(0, 2)
@@ -135,11 +135,11 @@ def test_the_critic_learns_alone():
 @pytest.mark.parametrize("kind", [OnDevicePPO, TritonPPO])
 def test_checkpoints_go_both_ways(kind):
     """Torch and the kernels continue from a checkpoint of either, and agree afterwards."""
-    first = make(kind)
+    first = make(kind, sizes=NARROW)
     record_rollout(first)
     choose([first], 0)
     first.update_minibatch()
-    plain, fused = make(OnDevicePPO, seed=8), make(seed=9)
+    plain, fused = make(OnDevicePPO, seed=8, sizes=NARROW), make(seed=9, sizes=NARROW)
     for alg in (plain, fused):
         alg.load_state_dict(first.state_dict())
         record_rollout(alg, 4)

@@ -51,10 +51,7 @@ def arrived(sent, decimation, delay):
     return np.stack([nothing if t < delay else at_physics_step[t - delay] for t in range(len(at_physics_step))])
 
 
-@pytest.mark.parametrize(
-    ("decimation", "delay"),
-    [(4, 0), (4, 1), (4, 9), (3, 4), (2, 9), (1, 3)],
-)
+@pytest.mark.parametrize(("decimation", "delay"), [(4, 0), (4, 1), (4, 9), (3, 4), (2, 9), (1, 3)])
 def test_physics_steps(make_task, decimation, delay):
     """The torque at physics step t is 8 N m times the action of physics step t - delay."""
     task = make_task("a1_torque", 3, **delayed(delay, delay, decimation=decimation))

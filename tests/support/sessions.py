@@ -15,16 +15,10 @@ from legged_torque.viewer.session import Session
 
 
 def new_session(folder, name, num_envs=2, ground=None, steps=(0,), clock=None, **settings):
-    """A session of a new run in a folder, with the last of its checkpoints.
+    """A session of a new run in a folder, which may be missing, with the last of its checkpoints of random weights.
 
-    Args:
-        folder: May be missing.
-        name: The task.
-        num_envs: Number of worlds.
-        ground: Settings of a small rough map; None for the task's own ground.
-        steps: Of training before each checkpoint; they are numbered from 0 on, and have random weights.
-        clock: In place of the real one.
-        settings: By dotted paths.
+    ``ground`` are settings of a small rough map, ``steps`` those of training before each checkpoint, numbered from 0
+    on; ``clock`` takes the place of the real one, and ``settings`` go by dotted paths.
     """
     env_cfg, train_cfg = task_registry.get_cfgs(name, Options(perturbation="none"))
     if ground:

@@ -11,6 +11,7 @@ from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadModel
 
 STEPS, WORLDS, NUM_ACTIONS = 3, 40, 6
+WIDE, NARROW = ([72, 136], [200, 24, 16]), ([24], [40])  # hidden layers of actor and critic
 MIRROR = {  # an order that is its own inverse, and signs
     "policy": ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, 1.0, 1.0]),
     "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
@@ -30,14 +31,14 @@ class Mirrored:
         self.mirror.maps = self.maps
 
 
-def build(kind, device="cpu", multi_head=False, symmetric=False, seed=0, std_type="log", **settings):
+def build(kind, device="cpu", multi_head=False, symmetric=False, seed=0, std_type="log", sizes=WIDE, **settings):
     """An algorithm of a kind, which gets actor, critic, storage and settings."""
     torch.manual_seed(seed)
     distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
     obs, groups = random_obs(WORLDS).to(device), {"actor": ["policy"], "critic": ["critic"]}
-    arguments = (obs, groups, "actor", NUM_ACTIONS, [72, 136], "elu", False, distribution)
+    arguments = (obs, groups, "actor", NUM_ACTIONS, sizes[0], "elu", False, distribution)
     actor = MultiHeadModel(*arguments, head_hidden_dims=[40]) if multi_head else MLPModel(*arguments)
-    critic = MLPModel(obs, groups, "critic", 1, [200, 24, 16], "elu")
+    critic = MLPModel(obs, groups, "critic", 1, sizes[1], "elu")
     storage = RolloutStorage("rl", WORLDS, STEPS, obs, [NUM_ACTIONS], device)
     if symmetric:
         function = "legged_torque.envs.base.symmetry:with_mirror_images"

@@ -43,8 +43,7 @@ def test_no_number_may_be_anything(bad):
 
 
 @pytest.mark.parametrize(
-    "change",
-    yaml.safe_load(Path(__file__).with_name("limits.yaml").read_text("utf-8"))["refused"],
+    "change", yaml.safe_load(Path(__file__).with_name("limits.yaml").read_text("utf-8"))["refused"]
 )
 def test_values_without_sense(change):
     """They are refused by the name of the setting, with what is allowed."""

@@ -4,9 +4,11 @@ import contextlib
 import functools
 import http.server
 import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from selenium.webdriver.common.by import By
 from support.browser import complaints, screen
 from support.clock import wait_for as wait
@@ -24,23 +26,7 @@ POLICIES = ("go2/torque_multihead", "g1/position")  # with a torque-speed curve;
 DRIVE = {"drive": {"model": "drive", "damping": 0.5, "stiffness": 200.0}}
 """A motor that asks for more than the limits, before them."""
 STEPS = 25
-RUN = """
-const [steps, motors, holds, done] = arguments;
-const { policy } = window.simulation;
-const [usual, refresh] = [policy.motors, policy.timing.refresh_torques];
-(async () => {
-  policy.motors = motors;
-  policy.timing.refresh_torques = !holds;
-  simulation.reset();
-  simulation.command = [0.5, 0.1, -0.2];
-  for (let i = 0; i < steps; i++) await simulation.step();
-  policy.motors = usual;
-  policy.timing.refresh_torques = refresh;
-  done([Array.from(simulation.robot.data.qpos), simulation.torques]);
-})();
-"""
-ADAPT = "[scene.coarsest, scene.finest] = [0.3, 1]; for (let i = 1e5; i--; ) scene.adapt(arguments[0]); "
-ADAPT += "return [scene.coarsest, scene.finest].indexOf(scene.ratio)"
+RUN, ADAPT = yaml.safe_load(Path(__file__).with_name("static_page.yaml").read_text("utf-8")).values()
 
 
 @pytest.fixture(scope="module", params=POLICIES)
