@@ -206,8 +206,11 @@ class Page:
     def _bind(self, control: viser.GuiInputHandle, value: Callable[[], Any], request: Callable[[Any], None]) -> None:
         """Show a value of the session in a control, and request what users choose."""
         self._shown.append((control, "value", value))
-        choose = functools.partial(self._attempt, control.label, lambda: request(control.value))
-        control.on_update(lambda event: choose() if event.client else None)  # a user has changed it
+
+        @control.on_update
+        async def choose(event: viser.GuiEvent) -> None:  # at once: a function would run after values are shown again
+            if event.client:  # a user has changed it
+                self._attempt(control.label, lambda: request(control.value))
 
     def _add_button(self, label: str, icon: Any, hint: str, action: Callable[[], None]) -> viser.GuiButtonHandle:
         """Add a button."""
