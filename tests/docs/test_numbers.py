@@ -281,9 +281,8 @@ def test_performance():
     assert "{:.0f} s pass with warm caches and {:.0f} s".format(*until) in text
     parts = [start["warm"][0][stage] for stage in stages[:3]]
     assert "before the task take {:.0f}, the task {:.0f}, the iteration {:.0f}, half".format(*parts) in text
-    torch, dynamo, warp, mujoco, more, inductor, patterns, rest, _ = start["profile"].values()
-    assert f"torch took {torch} s, `torch._dynamo`, which tensordict imports, {dynamo}, Warp and" in text
-    assert f"MuJoCo Warp {warp + mujoco:.1f}, `torch._inductor` {inductor}: a" in text
+    torch, dynamo, _, _, more, inductor, patterns, rest, _ = start["profile"].values()
+    assert f"imports of torch and tensordict took {torch + dynamo:.0f} s: a start" in text
     assert 0.45 < (more + inductor) / (more + inductor + patterns + rest) < 0.55
     two = next(each for each in data if "two_gpus" in each)
     both, one = (two[f"{name}_steps_per_s"] for name in ("two_gpus", "one_gpu"))
