@@ -29,7 +29,7 @@ LINES = {
     "legged_torque/experiments": 1103,
     "legged_torque/identification": 431,
     "legged_torque/importer": 1252,
-    "legged_torque/learning": 4105,
+    "legged_torque/learning": 4110,
     "legged_torque/motors": 1505,
     "legged_torque/runtime": 2047,
     "legged_torque/sensors": 302,

@@ -154,7 +154,12 @@ def make_evaluators(task: Any, policy: Policy, settings: dict, seed: int, captur
 
 
 def append_row(file: Path, row: dict[str, float]) -> None:
-    """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written."""
-    cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in row.values()]
-    lines = [cells] if file.is_file() and file.stat().st_size else [row, cells]
+    """Append a row to a CSV file, after a header if the file is new; a UserError if it cannot be written.
+
+    A file of another version keeps its columns.
+    """
+    header = file.read_text("utf-8").partition("\n")[0] if file.is_file() else ""
+    values = [row.get(name, math.nan) for name in header.split(",")] if header else row.values()
+    cells = [f"{value:.6g}" if isinstance(value, float) else str(value) for value in values]
+    lines = [cells] if header else [row, cells]
     append_whole(file, "".join(",".join(line) + "\n" for line in lines))

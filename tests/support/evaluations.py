@@ -5,8 +5,8 @@ from types import SimpleNamespace
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning import evaluator
 
-COLUMNS = "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,cost_of_transport,"
-COLUMNS += "mechanical_power,torque_rate,height,speed,falls_per_minute,critic_gradient_norm"
+COLUMNS = "steps,iteration,seconds,track_percentage,track_xy,track_angular,collision_force,peak_force,"
+COLUMNS += "cost_of_transport,mechanical_power,torque_rate,height,speed,falls_per_minute,critic_gradient_norm"
 
 
 def read_rows(file):
