@@ -82,7 +82,8 @@ class HangingRobots:
             (ticks, num_worlds, 2, joints).
         """
         engine, order, model = self._engine, self._order, self._engine.mj_model
-        start, everywhere = self._tensor(self._recording.measured[0]), self._taken[:, 0] >= 0
+        start = self._tensor(self._recording.measured[0])
+        everywhere = torch.ones(self.num_worlds, dtype=torch.bool, device=engine.device)
         self._values.copy_(self._tensor(parameters))
         self._past.copy_(start[1].expand_as(self._past))
         self._taken.zero_()

@@ -19,9 +19,9 @@ from legged_torque.utils.limits import NotNegative, Number, check_value
 
 
 class Background:
-    """A thread that writes while training goes on, one piece of work after the other.
+    """A thread that writes files while training goes on (asynchronous checkpointing), one after the other.
 
-    What Python has begun there is finished even if the training is interrupted.
+    Python ends only after its work, also if a training is interrupted; errors are silent then.
     """
 
     def __init__(self) -> None:
@@ -31,8 +31,7 @@ class Background:
         self._then: Callable[[], object] = lambda: None
 
     def start(self, work: Callable[[], None], then: Callable[[], object]) -> None:
-        """Begin a piece of work after the one before; ``then`` is called by :meth:`poll` when it is done."""
-        self.finish()
+        """Begin a piece of work, if that before is finished; ``then`` is called by :meth:`poll` when it is done."""
         self._work, self._then = self._pool.submit(work), then
 
     def poll(self) -> None:

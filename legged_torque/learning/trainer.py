@@ -105,8 +105,7 @@ class Trainer:
         first, last = self.current_learning_iteration, self.current_learning_iteration + num_learning_iterations
         guard = TrainingGuard(self.env.health)
         self._log.start(first, last, self.verbose)
-        self.save_checkpoint()
-        self._background.finish()  # the viewer shows it while the first iterations run
+        self.save_checkpoint()  # the viewer shows it while the first iterations run
         notify = self._log.display.notify if distributed.rank() == 0 else lambda text: None
         with self._log.display, StopRequest(notify) as stop:
             while self.current_learning_iteration < last and not guard.problem:
@@ -129,10 +128,9 @@ class Trainer:
                 self._log.prepare(self.current_learning_iteration, times, numbers, measured)
                 self.current_learning_iteration += 1
                 if self.current_learning_iteration % self.cfg["save_interval"] == 0 and not guard.problem:
-                    self.save_checkpoint()
+                    self._begin_checkpoint()
                 stopwatch.lap("logs and checkpoints")
             self.save_checkpoint()  # writes the last log too
-            self._background.finish()
         self.stopped_by = stop.number
         if self._log.broken_pipe:
             raise self._log.broken_pipe
@@ -193,18 +191,22 @@ class Trainer:
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def save_checkpoint(self) -> None:
-        """Save into the run's folder, with all that was logged, and warn if the simulation has dropped contacts.
+        """Save into the run's folder, with all that was logged, and warn if the simulation has dropped contacts."""
+        self._begin_checkpoint()
+        self._background.finish()
 
-        What is saved is that of now; files are written while training goes on.
-        """
+    def _begin_checkpoint(self) -> None:
+        """Do as :meth:`save_checkpoint`, but let files be written, with what there is now, while training goes on."""
         self._log.write()
+        self._background.finish()
         if self.log_dir is not None and self._saved_iteration != self.current_learning_iteration:
-            file = checkpoint_file(Path(self.log_dir), self.current_learning_iteration)
-            processes, state = self._worlds.gather(), checkpoint.on_host(self._state({}))
-            self._saved_iteration = self.current_learning_iteration
+            worlds, state = self._worlds.gather(), self._state({})
             if distributed.rank() == 0:
-                work = functools.partial(self._write, file, processes, state)
+                file = checkpoint_file(Path(self.log_dir), self.current_learning_iteration)
+                work = functools.partial(self._write, file, worlds, checkpoint.on_host(state))
                 self._background.start(work, functools.partial(self._announce, file))
+            else:
+                self._saved_iteration = self.current_learning_iteration
         warning = self.env.check_buffers()
         if warning:
             warn(warning)
@@ -230,16 +232,17 @@ class Trainer:
         }
         return state
 
-    def _write(self, file: Path, processes: list[dict[str, Any]], state: dict[str, Any]) -> None:
+    def _write(self, file: Path, worlds: dict[str, Any], state: dict[str, Any]) -> None:
         """Write the worlds of all processes, and then the checkpoint that they belong to."""
-        state["infos"]["worlds"] = digest = self._worlds.write(file, processes)
+        state["infos"]["worlds"] = digest = self._worlds.write(file, worlds)
         checkpoint.write(file, state)
         if digest:
             remove_other_worlds(file)
 
     def _announce(self, file: Path) -> None:
-        """Tell others that a checkpoint has been written."""
-        self.logger.save_model(str(file), checkpoint_number(file))
+        """Note that a checkpoint has been written, and tell others."""
+        self._saved_iteration = checkpoint_number(file)
+        self.logger.save_model(str(file), self._saved_iteration)
         if self.on_checkpoint:
             self.on_checkpoint(file)
 

@@ -24,28 +24,26 @@ class Worlds:
         self._owners = {"worlds": task} | ({"learner": learner} if hasattr(learner, "world_state_dict") else {})
         self._evaluation = {key: evaluation[key] for key in ("num_envs", "perturbation")}
 
-    def gather(self) -> list[dict[str, Any]]:
+    def gather(self) -> dict[str, Any]:
         """Return the worlds of all processes in the first one, copied to the host; nothing in the others.
 
         Nothing, too, of a task that cannot keep its worlds.
         """
         if not hasattr(self._task, "identity"):
-            return []
+            return {}
         state = {name: owner.world_state_dict() for name, owner in self._owners.items()}
         for other in self._others:
             state |= other.state_dict()
-        return [checkpoint.on_host(each) for each in distributed.gather_tensors(state, self._task.device)]
+        processes = [checkpoint.on_host(each) for each in distributed.gather_tensors(state, self._task.device)]
+        return {"identity": json.dumps(self._identity()), "processes": processes} if processes else {}
 
-    def write(self, checkpoint_file: Path, processes: list[dict[str, Any]]) -> str:
+    def write(self, checkpoint_file: Path, content: dict[str, Any]) -> str:
         """Write what :meth:`gather` returned, before the checkpoint that it belongs to, and return its digest.
 
         Empty where worlds cannot be kept: the checkpoint is worth more.
         """
-        if not processes:
-            return ""
         try:
-            content = {"identity": json.dumps(self._identity()), "processes": processes}
-            return checkpoint.write(worlds_file(checkpoint_file), content)
+            return checkpoint.write(worlds_file(checkpoint_file), content) if content else ""
         except UserError as error:
             warn(f"worlds would start anew in a resumed run: {error}")
             return ""

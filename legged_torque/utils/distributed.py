@@ -26,7 +26,7 @@ ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)}, 0, 0, 0)  # PR_SET_PDEATHSIG o
 os.execvp(sys.argv[1], sys.argv[1:])
 """
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
-_WORD = 8  # bytes: tensors that travel together begin at its multiples, as any type of numbers must
+_WORD = 16  # bytes: tensors that travel together begin at its multiples, as the widest numbers (complex128) must
 _shared: SharedMean | None = None  # of processes that this module has started, once they have found each other
 
 

@@ -182,9 +182,8 @@ def test_what_policies_bear(swept):
     drops = pd.read_csv(DOCS / "results" / "drops.csv").set_index(["height", "policy"])["peak_force"][0.5]
     robots = ("a1", "go1", "go2", "anymal_c")
     higher = [100 * (drops[f"{name}/torque_multihead"] / drops[f"{name}/position"] - 1) for name in robots]
-    assert (
-        "forces are {:.0f}, {:.0f}, {:.0f} and {:.0f}% above PD's on A1, Go1, Go2 and ANYmal C".format(*higher) in text
-    )
+    assert "{:.0f}, {:.0f}, {:.0f} and {:.0f}% above PD's on A1, Go1, Go2 and ANYmal C".format(*higher) in text
+    assert f"`a1/torque_damped`'s {100 * (1 - drops['a1/torque_damped'] / drops['a1/position']):.0f}% below" in text
     grip = base.loc["ground_friction", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     lost = grip.max() - grip[grip.index >= 0.44].min()
     assert 0.02 < lost.max() < 0.03 and "From a friction of 0.45 on, all stay within 0.03 of their best" in text

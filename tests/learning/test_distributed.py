@@ -23,6 +23,7 @@ from support.scripts import PATHS
 from support.settings import parse
 
 from legged_torque.envs import task_registry
+from legged_torque.learning.checkpoint import on_host
 from legged_torque.learning.guard import PATIENCE
 from legged_torque.utils import distributed
 from legged_torque.utils.config import to_dict
@@ -118,6 +119,13 @@ def give_up():
     return {"iterations": runner.current_learning_iteration, "reason": str(error.value)}
 
 
+def own(rank):
+    """Containers of a process, of shapes, types and strides that differ."""
+    tensors = {"bits": torch.arange(3 + rank) % 2 == 0, "none": torch.empty(0, 2), "one": torch.tensor(0.5 + rank)}
+    tensors["complex"] = torch.full((1, 2), 1.0 + rank * 1j, dtype=torch.complex128).T
+    return {"tensors": tensors, "words": ["a", rank, None]} | ({"more": torch.ones(5)} if rank else {})
+
+
 def average():
     """Learn from one minibatch per process, in the second case from bad numbers in one process."""
     notes = {}
@@ -137,6 +145,7 @@ def main(folder):
     """Do both and keep the notes; then resume with train.py, each in a folder of its own, until torchrun ends."""
     distributed.join("cpu")
     notes = {"average": average(), **train(folder)}
+    notes["gathered"] = on_host(distributed.gather_tensors(own(distributed.rank()), "cpu"))
     torch.save(notes, folder / f"{distributed.rank()}.pt")
     words = [f"--task={TASK}", "--device=cpu", "--logger=none", "--verbose", "--resume"]
     words += [f"--max_iterations={FOREVER}", "--set=runner.save_interval=1"]
@@ -189,6 +198,14 @@ def together(tmp_path_factory):
 def same(first, second):
     """Compare two dictionaries of tensors to the bit."""
     return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
+
+
+def test_containers_are_gathered(together):
+    """The first process gets those of both, of whatever shape and type; the other one nothing."""
+    _, (first, second), *_ = together
+    assert second["gathered"] == [] and len(first["gathered"]) == 2
+    for rank, found in enumerate(first["gathered"]):
+        assert not differences(dict(values(found)), dict(values(own(rank))))
 
 
 def test_one_policy_in_different_worlds(together):

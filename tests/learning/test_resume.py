@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import threading
 from pathlib import Path
 
 import pytest
@@ -207,6 +208,35 @@ def test_what_killed_processes_have_left_is_removed(copied):
         file.touch()
     start(None, "--resume", f"--load_run={copied}")
     assert not dead.exists() and alive.exists()
+
+
+def test_a_checkpoint_is_of_its_iteration(tmp_path, monkeypatch):
+    """While its files are written, training goes on; they have what there was before."""
+    runner, gone_on, noted, kept = begin(tmp_path), threading.Event(), {}, {}
+    runner.cfg["save_interval"] = 1
+    write, collect = checkpoint.write, runner.collect_rollout
+
+    def write_late(file, state):
+        if file.name in ("worlds_1.pt", "model_1.pt"):
+            assert gone_on.wait(60.0)
+            kept.update({name: value.clone() for name, value in values(state) if isinstance(value, torch.Tensor)})
+        return write(file, state)
+
+    def collect_and_note():
+        if runner.current_learning_iteration == 1:
+            state = {"processes": [{"worlds": runner.env.world_state_dict()}]}
+            state["actor_state_dict"] = runner.alg.actor.state_dict()
+            noted.update({name: value.clone() for name, value in values(state)})
+        collect()
+        if runner.current_learning_iteration == 1:
+            gone_on.set()
+
+    monkeypatch.setattr(checkpoint, "write", write_late)
+    runner.collect_rollout = collect_and_note
+    runner.learn(3)
+    after = dict(values({"processes": [{"worlds": runner.env.world_state_dict()}]}))
+    assert len(noted) > 30 and not differences(noted, {name: kept[name] for name in noted})
+    assert differences({name: noted[name] for name in after}, after)
 
 
 def test_files_that_cannot_be_written(tmp_path, capsys):

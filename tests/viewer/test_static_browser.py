@@ -26,7 +26,7 @@ POLICIES = ("go2/torque_multihead", "g1/position")  # with a torque-speed curve;
 DRIVE = {"drive": {"model": "drive", "damping": 0.5, "stiffness": 200.0}}
 """A motor that asks for more than the limits, before them."""
 STEPS = 25
-RUN, ADAPT = yaml.safe_load(Path(__file__).with_name("static_page.yaml").read_text("utf-8")).values()
+SCRIPTS = yaml.safe_load(Path(__file__).with_name("static_page.yaml").read_text("utf-8"))
 
 
 @pytest.fixture(scope="module", params=POLICIES)
@@ -82,7 +82,7 @@ def test_page(browser, served):
     wait(lambda: "real time" in status(browser), 60.0)
     browser.find_element(By.ID, "pause").click()
     motors = static_page.motors(description(name))
-    qpos, torques = browser.execute_async_script(RUN, STEPS, motors, name == POLICIES[0])
+    qpos, torques = browser.execute_async_script(SCRIPTS["run"], STEPS, motors, name == POLICIES[0])
     expected = in_mujoco(name, STEPS)
     np.testing.assert_allclose(qpos, expected[0], atol=1e-4)
     np.testing.assert_allclose(torques, expected[1], atol=1e-2)
@@ -97,5 +97,5 @@ def test_page(browser, served):
     for width in (1920, 1280, 390):
         with screen(browser, width, 800, 0.1):  # few pixels are drawn
             assert browser.execute_script("return document.documentElement.scrollWidth") <= width
-    assert [browser.execute_script(ADAPT, time) for time in (1 / 30, 1 / 60)] == [0, 1]
+    assert [browser.execute_script(SCRIPTS["adapt"], time) for time in (1 / 30, 1 / 60)] == [0, 1]
     assert not complaints(browser)

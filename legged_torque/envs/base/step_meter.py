@@ -61,8 +61,8 @@ class StepMeter:
     def _add_step(self) -> None:
         """Add the physics step that has just been made."""
         torques, vel = self._motors.before_friction(self._state.torques), self._state.dof_vel
-        force = self._state.contact_force.norm(dim=2).sum(dim=1)
-        torch.fmax(self.peak_force, force, out=self.peak_force)  # of a world that diverges, what it was before
+        force = self._state.contact_force.norm(dim=2).sum(dim=1).nan_to_num(0.0, 0.0)  # of a world that diverges
+        torch.maximum(self.peak_force, force, out=self.peak_force)
         change = (torques - self._last_torques).abs().mean(dim=1)
         self.torque_change.add_(torch.where(self._has_last, change, 0.0))
         self._last_torques.copy_(torques)
