@@ -26,7 +26,7 @@ from legged_torque.utils.options import DEFAULT_TASK, Options
 from legged_torque.utils.policies import policy_names
 from legged_torque.utils.task_registry import task_registry
 
-LAST_WORDS = 2.0  # seconds after which a further process reports an error that the first one has not reported
+LAST_WORDS = 5.0  # seconds after which a further process reports an error, if the first one has not ended by then
 COMMAND = "legged-torque"  # the console command that runs every script
 CLOCKS = ("policy_hz", "physics_hz")  # options in Hz
 SETTINGS = ("task", "set", "perturbation", "seed", "device", "ranges", "motors", "task_file", *CLOCKS)  # of every task
