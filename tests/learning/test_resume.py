@@ -266,4 +266,4 @@ def test_files_that_cannot_be_written(tmp_path, capsys):
     (folder / "model_3.pt").mkdir()
     runner.cfg["save_interval"] = 1
     assert f"cannot write '{folder / 'model_3.pt'}" in error_of(runner.learn, 100)
-    assert runner.current_learning_iteration in (3, 4)  # it is told soon, while the thread writes the next one
+    assert runner.current_learning_iteration in (3, 4)  # the error is raised soon after the thread has met it
