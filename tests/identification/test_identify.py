@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from conftest import NUMBERS, POSE, TILT, TRUTH, noisy, record, sweep, write_log
+from support.one_leg import NUMBERS, POSE, TILT, TRUTH, noisy, record, sweep, write_log
 from support.scripts import run_here
 from support.settings import error_of
 

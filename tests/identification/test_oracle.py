@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
-from conftest import NUMBERS, PERIOD, TRUTH, fixed, record, sweep
+from support.one_leg import NUMBERS, PERIOD, TRUTH, fixed, record, sweep
 
 from legged_torque.identification.fit import Problem
 from legged_torque.identification.worlds import HangingRobots

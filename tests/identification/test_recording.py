@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import TILT, noisy, write_log
+from support.one_leg import TILT, noisy, write_log
 from support.settings import error_of
 
 from legged_torque.identification.recording import Recording, read_recording

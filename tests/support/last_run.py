@@ -14,7 +14,7 @@ from support.scripts import ROOT
 
 FOLDER = ROOT / "tests" / "gpu"
 FILE = FOLDER / "last_run.json"
-TESTED = ("sim", "motors", "sensors", "learning", "envs")
+TESTED = ("sim", "motors", "sensors", "learning", "envs", "identification")
 """Folders of the package of which a change asks for another run."""
 PACKAGES = ("torch", "triton", "warp-lang", "mujoco", "mujoco-warp", "rsl-rl-lib")
 _PARTIAL = ("keyword", "markexpr", "deselect", "lf", "stepwise")  # options of pytest that leave tests out
