@@ -24,7 +24,6 @@ from legged_torque.utils.limits import Limits, Positive, Rate
 
 ROBOT = "go2"  # at the other end of a network interface
 POLL = 0.01  # seconds between two looks at keys and other devices
-MOST_COMMANDS = 500.0  # a second, without --rate
 
 
 def parse_args() -> argparse.Namespace:
@@ -72,7 +71,7 @@ def main() -> None:
     args = parse_args()
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy
-        from legged_torque.runtime.controller import Controller
+        from legged_torque.runtime.controller import Controller, default_rate
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.session import Session
         from legged_torque.runtime.view import View
@@ -111,11 +110,6 @@ def main() -> None:
         raise loop.error
     if session.stops:
         sys.exit(1)
-
-
-def default_rate(of_policy: float) -> float:
-    """Return the commands per second for so many actions: their largest multiple up to 500, or as many."""
-    return of_policy * max(1.0, (MOST_COMMANDS + 1e-6) // of_policy)
 
 
 def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:

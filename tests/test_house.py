@@ -31,19 +31,19 @@ LINES = {
     "legged_torque/importer": 1252,
     "legged_torque/learning": 4110,
     "legged_torque/motors": 1505,
-    "legged_torque/runtime": 2047,
+    "legged_torque/runtime": 2058,
     "legged_torque/sensors": 302,
     "legged_torque/sim": 5741,
     "legged_torque/terrain": 591,
-    "legged_torque/utils": 3362,
+    "legged_torque/utils": 3307,
     "legged_torque/viewer": 2490,
     "scripts": 2020,
     "paper": 3217,
-    "tools": 1236,
-    "tests": 24367,
+    "tools": 1469,
+    "tests": 24405,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_040  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 31_990  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -10,6 +10,13 @@ from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake
 from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
+MOST_COMMANDS = 500.0  # a second, unless more are asked for
+
+
+def default_rate(of_policy: float) -> float:
+    """Return the commands per second for so many actions: their largest multiple up to 500, or as many."""
+    return of_policy * max(1.0, (MOST_COMMANDS + 1e-6) // of_policy)
+
 
 class Mode(Enum):
     """What the robot does."""
@@ -50,7 +57,8 @@ class Controller:
         self.mode, self.reason = Mode.DAMPING, ""
         self.state: RobotState | None = None
         self.velocity_command = np.zeros(3)
-        self._since, self._state_time, self._now, self._on_time, self._damaged = 0.0, -np.inf, 0.0, 0.0, 0
+        self._since, self._state_time, self._now, self._on_time = 0.0, -np.inf, 0.0, 0.0
+        self._damaged = self._missed = 0  # messages, and deadlines in a row
         self._problems: list[str] = []  # of the last look
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
         self.sent, self._lock = self._gentle(0.0), threading.Lock()
@@ -124,6 +132,7 @@ class Controller:
     def _step(self, received: Received, now: float, missed: bool) -> MotorCommand:
         """Do what :meth:`step` says, if all goes well."""
         self._now, self._on_time = now, self._on_time if missed else now
+        self._missed = self._missed + 1 if missed else 0
         if isinstance(received.newest, RobotState):
             self.state, self._state_time, self._damaged = received.newest, now, 0
         self._damaged += received.wrong_crc
@@ -149,7 +158,8 @@ class Controller:
         """Return why the robot must not move."""
         if self.state is None:
             return "the robot has not said anything yet"
-        if (late := self._now - self._on_time) > self.brakes.max_missed + 1e-6:
+        allowed = self.brakes.max_slow if self._missed > 1 else self.brakes.max_missed
+        if (late := self._now - self._on_time) > allowed + 1e-6:
             return f"all deadlines of {1e3 * late:.0f} ms were missed"
         seen = Received(None, self._damaged, problems=self._problems)
         return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)

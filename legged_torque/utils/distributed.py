@@ -17,7 +17,6 @@ from legged_torque.utils.errors import UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from legged_torque.utils.peer_mean import PeerMean
     from legged_torque.utils.shared_mean import SharedMean
 
 MAX_PROCESSES = 8  # that this module starts: each holds 0.7 GB of memory
@@ -28,7 +27,7 @@ os.execvp(sys.argv[1], sys.argv[1:])
 """
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
 _WORD = 16  # bytes: tensors that travel together begin at its multiples, as the widest numbers (complex128) must
-_shared: SharedMean | PeerMean | None = None  # of processes of one machine that have found each other
+_shared: SharedMean | None = None  # of processes that this module has started, once they have found each other
 
 
 def world_size() -> int:
@@ -119,30 +118,12 @@ def join(device: str) -> None:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
         from legged_torque.utils.shared_mean import SharedMean, can_share
 
-        _shared = SharedMean(rank(), world_size()) if can_share() else _peer_mean(device)
+        _shared = SharedMean(rank(), world_size()) if can_share() else None
     except ValueError as error:  # an environment variable that torchrun sets is missing
         raise UserError(f"WORLD_SIZE is {world_size()}, but torchrun has not started this process: {error}") from None
     except torch.distributed.DistError as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise UserError(f"the {world_size()} processes do not find each other: {reason}") from None
-
-
-def _peer_mean(device: str) -> PeerMean | None:
-    """Return a mean by the memory of all GPUs; nothing unless all are in one machine and can read each other's."""
-    import torch
-
-    if torch.device(device).type != "cuda" or local_world_size() != world_size():
-        return None
-    from legged_torque.utils.peer_mean import PeerMean
-
-    others = [number for number in range(world_size()) if number != local_rank()]
-    if any_process(not all(torch.cuda.can_device_access_peer(local_rank(), number) for number in others), device):
-        return None
-    try:
-        mean = PeerMean(device)
-    except RuntimeError:  # as where a container forbids it; NCCL has other ways
-        mean = None
-    return None if any_process(mean is None, device) else mean
 
 
 def average(tensors: list[Tensor]) -> None:

@@ -292,11 +292,36 @@ def test_performance():
     more = [two["two_gpus"][name] - two["one_gpu"][name] for name in stages]
     said = "take {:.1f} s more, logs and checkpoints, with the worlds of both processes, {:.1f} s, the end {:.1f} s"
     assert said.format(*more) in text
+    until = next(each for each in data if "seeds" in each)["seeds"]
+    (first, last), late = ((min(of), max(of)) for of in ([s[key][0] for s in until if s[key]] for key in ("70", "85")))
+    text = text_of("performance.md", "- **70%**")
+    assert f"took {first:.1f} to {last:.1f} s" in text and "{:.1f} and {:.1f} s; one seed".format(*late) in text
     _, rows = rows_of("performance.md", "trainer | settings")
-    compared = [*data[1]["rows"][:2], *data[-1]["rows"]]
-    for row, (_, _, _, step, iteration, _, _, tracking) in zip(compared, rows[:3], strict=True):
-        assert same(step, row["step_ms"]) and same(iteration, row["iteration_ms"])
+    compared = [*data[1]["rows"], *data[-1]["rows"]]
+    for row, (_, _, _, step, iteration, speed, start, tracking) in zip(compared, rows, strict=True):
+        assert same(step, row["step_ms"]) and same(iteration, row["iteration_ms"]) and same(start, row["start_up_s"])
+        assert abs(float(speed.replace(" ", "")) / row["training_steps_per_s"] - 1.0) < 0.005
         assert same(tracking.split()[0], row["tracking_after_iterations"][-1][2])
+    mine, theirs = ([row["training_steps_per_s"] for row in data[i]["rows"]] for i in (-1, 1))
+    times = f"{mine[0] / theirs[1]:.0f} times as many steps/s on MuJoCo Warp, and {mine[1] / theirs[1]:.0f} times with"
+    text = text_of("performance.md", "## Compared with mjlab")
+    assert times in text and f"own, {mine[2] / 133e3:.0f} to {mine[2] / theirs[0]:.0f} times" in text
+    seconds = [row["seconds_to_70"] - row["start_up_s"] for row in data[-1]["rows"]]
+    assert "after {:.0f} s on MuJoCo Warp (288b895), and {:.1f} and {:.1f} s with".format(*seconds) in text
+
+
+def test_faults():
+    """Longest times until faults ended in damping, how often each was tried, and torques beyond limits."""
+    data, page = pd.read_csv(DOCS / "results" / "faults.csv.gz"), "howto/run_on_robot.md"
+    longest = data.groupby(["policy_hz", "fault"])["ms"].agg(["max", "size"])
+    _, rows = rows_of(page, "fault | policy at 50 Hz")
+    assert sorted(", ".join(faults for faults, *_ in rows).split(", ")) == sorted(data["fault"].unique())
+    assert "Longest of 72 times" in text_of(page, "## Brakes") and (longest["size"] == 72).all()
+    for faults, *times in rows:
+        of = longest.loc[(slice(None), faults.split(", ")), "max"].groupby("policy_hz").max()
+        assert [f"{of[rate]:.0f}" for rate in (50, 200)] == times
+    most = data[~data["fault"].str.startswith("joint")].groupby("policy_hz")["excess"].max()
+    assert f"up to {most[200]:.0f} N m beyond limits at 200 Hz" in text_of(page, "## Brakes") and most[50] < 1e-3
 
 
 def test_kernels_of_an_update():

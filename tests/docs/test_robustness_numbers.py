@@ -99,6 +99,8 @@ def conditions():
 
 MEASURED = {"undisturbed": ("as trained", "track_percentage"), "torques change": ("as trained", "torque_rate")}
 MEASURED |= {"noise x 4": ("noise 4 times", "track_percentage"), "falls, dead leg": ("dead leg", "falls_per_minute")}
+MEASURED |= {"peak force [N]": ("drop 50 cm", "peak_force")}
+DAMPED = {"default torque": "damping, history", "PD": "tuned"}
 """Condition and metric of columns; others are tracking in the condition of their name."""
 
 
@@ -108,6 +110,7 @@ def test_table_of_conditions(conditions):
     of = conditions.set_index(["trained", "task", "condition", "metric"]).sort_index(kind="stable")["mean"]
     assert len(rows) == 9
     for number, column in enumerate(columns[2:]):
+        fewer = 2 * (column == "peak force [N]")  # rows with a seed less
         measured = MEASURED.get(column, (column, "track_percentage"))
         values = [of[(*trained_as(policy), *measured)] for policy, *_ in rows]
         differs = [False, *(p < 0.05 for p in holm([welch(each, values[0]) for each in values[1:7]])), False]
@@ -115,7 +118,9 @@ def test_table_of_conditions(conditions):
         digits = 3 if measured[1] == "track_percentage" else 0
         found = [f"{each.mean():.{digits}f}" + "*" * int(star) for each, star in zip(values, differs, strict=True)]
         assert [cells[1 + number] for _, *cells in rows] == found, column
-        assert [int(cells[0]) for _, *cells in rows] == [*map(len, values)]
+        assert [len(each) for each in values] == [
+            int(seeds) - (0 < i <= fewer) for i, (_, seeds, *_) in enumerate(rows)
+        ]
 
 
 def test_other_conditions(conditions):
@@ -125,6 +130,9 @@ def test_other_conditions(conditions):
     drops = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").groupby(level=[0, 1]).mean()
     one = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").max()
     assert f"falls more than {drops.max():.1f} times a minute, one training of the combination {one:.1f} times" in text
+    peaks = of.xs("drop 50 cm", level="condition").xs("peak_force", level="metric")
+    recipe, tuned = (peaks[trained_as(f"{name}, 20 ms, {how}")] for name, how in DAMPED.items())
+    assert f"{1 - recipe.mean() / tuned.mean():.0%} below tuned PD's (p = {welch(recipe, tuned):.3f})" in text
     base = text_of("results.md", "- **Trained with ideal motors**")
     ideal = of["ideal motors, no latency"].xs("track_percentage", level="metric")
     mean = ideal.groupby(level=[0, 1]).mean().unstack(level=0)
@@ -139,10 +147,11 @@ def test_repeated_trainings():
     """The same settings and seed on another machine, by commits that train alike, give the same sweeps."""
     data = pd.read_csv(DOCS / "results" / "repeated.csv.gz")
     apart = (data["track_percentage"] - data["first"].round(4)).abs()
-    assert len(data.groupby(["task", "trained", "seed"])) == 28 and apart.max() < 1e-6
-    assert (data["commit"] != data["first_commit"]).all()
-    sweeps = data.groupby(["task", "trained", "seed", "parameter"]).ngroups
-    assert f"to four digits in all {sweeps} sweeps of 28 trainings" in text_of("results.md", "## What policies bear")
+    trainings = data.groupby(["task", "trained", "seed", "commit"]).ngroups
+    assert apart.max() < 1e-6 and (data["commit"] != data["first_commit"]).all()
+    sweeps = data.groupby(["task", "trained", "seed", "commit", "parameter"]).ngroups
+    said = f"{trainings} trainings tracked the same to four digits in all {sweeps} sweeps and conditions"
+    assert said in text_of("results.md", "## What policies bear")
 
 
 def test_what_policies_bear(swept):
@@ -179,11 +188,10 @@ def test_what_policies_bear(swept):
             energy = base.loc["action_delay", "cost_of_transport", steps, task]
             ends.append(f"{energy.min():.3f} to {energy.max():.3f}")
     assert "has a cost of transport of {}, PD of {}; with actions 10 ms late {} and {}.".format(*ends) in text
-    drops = pd.read_csv(DOCS / "results" / "drops.csv").set_index(["height", "policy"])["peak_force"][0.5]
-    robots = ("a1", "go1", "go2", "anymal_c")
+    drops = pd.read_csv(DOCS / "results" / "drops.csv").set_index("policy")["peak_force"]
+    robots = ("go1", "go2", "anymal_c")
     higher = [100 * (drops[f"{name}/torque_multihead"] / drops[f"{name}/position"] - 1) for name in robots]
-    assert "{:.0f}, {:.0f}, {:.0f} and {:.0f}% above PD's on A1, Go1, Go2 and ANYmal C".format(*higher) in text
-    assert f"`a1/torque_damped`'s {100 * (1 - drops['a1/torque_damped'] / drops['a1/position']):.0f}% below" in text
+    assert "{:.0f}, {:.0f} and {:.0f}% above PD's on Go1, Go2 and ANYmal C".format(*higher) in text
     grip = base.loc["ground_friction", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     lost = grip.max() - grip[grip.index >= 0.44].min()
     assert 0.02 < lost.max() < 0.03 and "From a friction of 0.45 on, all stay within 0.03 of their best" in text

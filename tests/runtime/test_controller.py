@@ -183,8 +183,14 @@ def test_every_fault_ends_in_damping(policy):
 def test_missed_deadlines_and_a_dead_program(policy):
     """A program that is late damps; one that says nothing more leaves a robot that damps itself."""
     world = World(policy).stand()
-    assert world.run(round(RATE * Brakes.max_missed), missed=True) == Mode.STAND
+    assert world.run(round(RATE * Brakes.max_slow), missed=True) == Mode.STAND
     assert world.run(1, missed=True) == Mode.DAMPING
+    assert world.controller.reason == "all deadlines of 10 ms were missed"
+    for late, mode in ((6, Mode.STAND), (7, Mode.DAMPING)):  # ticks in which the program was halted
+        world.run(1)
+        assert world.controller.request(Mode.STAND) == ""
+        world.ticks += late
+        assert world.run(1, missed=True) == mode
     assert world.controller.reason == "all deadlines of 16 ms were missed"
     world.run(1)
     assert not world.robot.is_damping

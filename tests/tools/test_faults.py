@@ -1,0 +1,21 @@
+"""Faults over DDS in real time end in damping; how soon depends on the machine, and is not tested."""
+
+import json
+import sys
+
+from support.exports import export_random
+
+from tools import faults
+
+
+def test_each_fault_ends_in_damping(make_task, tmp_path, monkeypatch, capsys):
+    """One of each kind; only joints that are set to another speed or place lead to torques beyond limits."""
+    export_random(make_task, "go2_torque_multihead", tmp_path / "out")
+    words = ["faults", str(tmp_path / "out"), "--trials", str(len(faults.KINDS))]
+    monkeypatch.setattr(sys, "argv", [*words, "--json", str(tmp_path / "faults.json")])
+    faults.main()
+    rows = json.loads((tmp_path / "faults.json").read_text())["rows"]
+    assert [row["fault"] for row in rows] == [*faults.KINDS]
+    assert all(0.0 < row["ms"] < 1e3 * faults.LIMIT for row in rows)
+    assert all((row["excess"] < 1e-3) != row["fault"].startswith("joint") for row in rows)
+    assert f"{len(rows)} faults" in capsys.readouterr().out
