@@ -30,7 +30,9 @@ from legged_torque.runtime.sim_robot import Faults, SimRobot
 from legged_torque.runtime.unitree_go2 import encode_state
 from legged_torque.utils.cli import Parser, check_args, check_output, run_script
 from legged_torque.utils.display import Counter
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json
+from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Count
 from legged_torque.utils.runs import package_versions
 
@@ -60,6 +62,7 @@ def program(export: Path, rate: float, pipe: Connection) -> None:
 
     The time of a broken policy is that of its first action, told when "asked".
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     policy = Policy(export)
     transport = Go2Robot("lo", DOMAIN)
     controller = Controller(policy, transport.joint_order, rate, Brakes(stand_up=STAND_UP))
@@ -202,14 +205,20 @@ def main() -> None:
     if args.json:
         check_output(args.json)
     description, rng = Policy(args.export).description, np.random.default_rng(args.seed)
+    if (name := description["robot"]["name"]) != "go2":
+        raise UserError(f"the policy is of the robot '{name}'; only a 'go2' can be simulated over DDS")
     rows: list[dict[str, Any]] = []
     rate = default_rate(description["timing"]["control_frequency"])
     (pipe, theirs), side = mp.Pipe(), Robot(resource_path(description["robot"]["file"]))
     process = mp.get_context("spawn").Process(target=program, args=(args.export, rate, theirs), daemon=True)
     process.start()
     stopped = 0
-    with RealTimeLoop(RATE, side.tick), Counter("faults", args.trials) as counter:
-        while len(rows) < args.trials and process.is_alive():
+    with (
+        StopRequest(lambda text: None) as stop,
+        RealTimeLoop(RATE, side.tick),
+        Counter("faults", args.trials) as counter,
+    ):
+        while len(rows) < args.trials and not stop.requested:
             row = trial(KINDS[len(rows) % len(KINDS)], side, pipe, process.pid or 0, rng)
             if row:
                 rows.append(row)
