@@ -162,8 +162,11 @@ def trial(name: str, side: Robot, pipe: Connection, pid: int, rng: np.random.Gen
 
     def tell(word: str) -> tuple[float, Any]:
         """Tell the program, and return when it did what, and its answer."""
-        pipe.send(word)
-        return pipe.recv()
+        try:
+            pipe.send(word)
+            return pipe.recv()
+        except (EOFError, OSError):
+            raise UserError("the program with the policy has ended, see above") from None
 
     tell("mend")
     side.change(on_its_feet)
@@ -212,6 +215,7 @@ def main() -> None:
     (pipe, theirs), side = mp.Pipe(), Robot(resource_path(description["robot"]["file"]))
     process = mp.get_context("spawn").Process(target=program, args=(args.export, rate, theirs), daemon=True)
     process.start()
+    theirs.close()  # so that its end is noticed
     stopped = 0
     with (
         StopRequest(lambda text: None) as stop,
