@@ -306,6 +306,8 @@ def test_performance():
     times = f"{mine[0] / theirs[1]:.0f} times as many steps/s on MuJoCo Warp, and {mine[1] / theirs[1]:.0f} times with"
     text = text_of("performance.md", "## Compared with mjlab")
     assert times in text and f"own, {mine[2] / 133e3:.0f} to {mine[2] / theirs[0]:.0f} times" in text
+    whole = [row["steps_per_s_of_the_display"] / 1e6 for row in data[-1]["rows"][1:]]
+    assert "ours made {:.1f} and {:.1f} million steps/s".format(*whole) in text
     seconds = [row["seconds_to_70"] - row["start_up_s"] for row in data[-1]["rows"]]
     assert "after {:.0f} s on MuJoCo Warp (288b895), and {:.1f} and {:.1f} s with".format(*seconds) in text
 
@@ -317,6 +319,7 @@ def test_faults():
     _, rows = rows_of(page, "fault | policy at 50 Hz")
     assert sorted(", ".join(faults for faults, *_ in rows).split(", ")) == sorted(data["fault"].unique())
     assert "Longest of 72 times" in text_of(page, "## Brakes") and (longest["size"] == 72).all()
+    assert data["ms"].notna().all()
     for faults, *times in rows:
         of = longest.loc[(slice(None), faults.split(", ")), "max"].groupby("policy_hz").max()
         assert [f"{of[rate]:.0f}" for rate in (50, 200)] == times

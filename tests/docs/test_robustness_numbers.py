@@ -150,7 +150,9 @@ def test_repeated_trainings():
     trainings = data.groupby(["task", "trained", "seed", "commit"]).ngroups
     assert apart.max() < 1e-6 and (data["commit"] != data["first_commit"]).all()
     sweeps = data.groupby(["task", "trained", "seed", "commit", "parameter"]).ngroups
-    said = f"{trainings} trainings tracked the same to four digits in all {sweeps} sweeps and conditions"
+    different = data.groupby(["task", "trained", "seed"]).ngroups
+    said = f"{different} trainings, {trainings - different} of them twice, tracked the same to four decimals in all "
+    said += f"{sweeps} sweeps and conditions"
     assert said in text_of("results.md", "## What policies bear")
 
 

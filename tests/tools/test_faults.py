@@ -9,7 +9,7 @@ from tools import faults
 
 
 def test_each_fault_ends_in_damping(make_task, tmp_path, monkeypatch, capsys):
-    """One of each kind; only joints that are set to another speed or place lead to torques beyond limits."""
+    """One of each kind; no torque beyond limits, unless a joint is set to another speed or place."""
     export_random(make_task, "go2_torque_multihead", tmp_path / "out")
     words = ["faults", str(tmp_path / "out"), "--trials", str(len(faults.KINDS))]
     monkeypatch.setattr(sys, "argv", [*words, "--json", str(tmp_path / "faults.json")])
@@ -17,5 +17,5 @@ def test_each_fault_ends_in_damping(make_task, tmp_path, monkeypatch, capsys):
     rows = json.loads((tmp_path / "faults.json").read_text())["rows"]
     assert [row["fault"] for row in rows] == [*faults.KINDS]
     assert all(0.0 < row["ms"] < 1e3 * faults.LIMIT for row in rows)
-    assert all((row["excess"] < 1e-3) != row["fault"].startswith("joint") for row in rows)
+    assert all(row["excess"] < 1e-3 for row in rows if not row["fault"].startswith("joint"))
     assert f"{len(rows)} faults" in capsys.readouterr().out
