@@ -54,7 +54,6 @@ def main() -> None:
         from legged_torque.runtime.dds import Go2Side
         from legged_torque.runtime.loop import RealTimeLoop
         from legged_torque.runtime.sim_robot import Faults, SimRobot
-        from legged_torque.runtime.unitree_go2 import encode_state
         from legged_torque.viewer.native import check_display
     if args.viewer:
         check_display("sim_robot.py without --viewer")
@@ -72,9 +71,7 @@ def main() -> None:
         robot.step(side.receive())
         state, is_damaged = robot.says()
         if state is not None:
-            message = encode_state(state)
-            message.crc ^= is_damaged
-            side.publish(message)
+            side.send(state, is_damaged)
 
     end, next_line = start + (args.seconds or math.inf), start
     show = window(robot) if args.viewer else contextlib.nullcontext(lambda: True)

@@ -27,7 +27,6 @@ from legged_torque.runtime.interface import MotorCommand
 from legged_torque.runtime.loop import RealTimeLoop
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import Faults, SimRobot
-from legged_torque.runtime.unitree_go2 import encode_state
 from legged_torque.utils.cli import Parser, check_args, check_output, run_script
 from legged_torque.utils.display import Counter
 from legged_torque.utils.errors import UserError
@@ -36,10 +35,11 @@ from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Count
 from legged_torque.utils.runs import package_versions
 
-DOMAIN, RATE = 7, 500.0  # of DDS; messages per second, as a Go2
+RATE = 500.0  # messages per second, as a Go2
 STAND_UP = 0.05  # seconds; the robot is put on its feet
 LIMIT = 0.2  # seconds after which a fault counts as unnoticed
 COMMAND = (0.5, 0.0, 0.2)
+GIVE_UP = 20  # trials in a row before whose fault the robot was stopped
 OF_ROBOT: dict[str, Callable[[SimRobot], Any]] = {
     "silent": lambda robot: setattr(robot.faults, "silent", True),
     "states 100 ms late": lambda robot: setattr(robot.faults, "delay", 0.1),
@@ -51,20 +51,21 @@ OF_ROBOT: dict[str, Callable[[SimRobot], Any]] = {
     "joint beyond its range": lambda robot: robot.data.qpos.__setitem__(7, 1.6),
 }
 """What goes wrong with the robot. Its messages cannot say that a number is not finite."""
-OF_PROGRAM = ("policy not finite", "policy out of range", "error in the program", "late ticks", "operator")
+OF_POLICY = ("policy not finite", "policy out of range")
+OF_PROGRAM = (*OF_POLICY, "error in the program", "late ticks", "operator")
 """And with the program; late ticks take 4 ms more each."""
 HALTED = "program halted"  # so that only the robot's watchdog is left
 KINDS = (*OF_ROBOT, *OF_PROGRAM, HALTED)
 
 
-def program(export: Path, rate: float, pipe: Connection) -> None:
+def program(export: Path, domain: int, rate: float, pipe: Connection) -> None:
     """Run a policy, and obey a pipe: modes, and what is to go wrong; "mend" ends all of it.
 
-    The time of a broken policy is that of its first action, told when "asked".
+    The time of a broken policy is that of its first action, told when "asked"; None if there was none.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process ends this one
     policy = Policy(export)
-    transport = Go2Robot("lo", DOMAIN)
+    transport = Go2Robot("lo", domain)
     controller = Controller(policy, transport.joint_order, rate, Brakes(stand_up=STAND_UP))
     controller.velocity_command = np.array(COMMAND)
     network, receive, num_actions = policy.session, transport.receive, policy.description["network"]["num_actions"]
@@ -97,28 +98,32 @@ def program(export: Path, rate: float, pipe: Connection) -> None:
         "error in the program": lambda: setattr(controller.brakes, "max_tilt", "a mistake"),
         "late ticks": lambda: setattr(transport, "receive", late),
         "operator": lambda: controller.request(Mode.DAMPING),
-        "asked": lambda: asked[0],
+        "asked": lambda: asked[0] if asked else None,
         "mend": mend,
         **{mode.value: lambda mode=mode: controller.request(mode) for mode in (Mode.STAND, Mode.POLICY)},
     }
-    with RealTimeLoop(rate, Session(controller, transport).tick):
-        while (word := pipe.recv()) != "end":
+    with RealTimeLoop(rate, Session(controller, transport).tick) as loop:
+        while loop.error is None and (word := pipe.recv()) != "end":
             pipe.send((time.monotonic(), words[word]()))
+    transport.close()
+    if loop.error is not None:
+        raise loop.error
 
 
 class Robot:
     """The robot's process: its side of DDS.
 
     Attributes:
+        side: Its end of DDS.
         robot: The robot.
         damps_since: Time since which it only damps [s]; None if it does more.
         begun: When the last change was made [s].
     """
 
-    def __init__(self, xml: Path) -> None:
+    def __init__(self, xml: Path, domain: int) -> None:
         """Prepare the robot, lying."""
-        self._side = Go2Side("lo", DOMAIN)
-        self.robot = SimRobot(xml, self._side.joint_order, RATE)
+        self.side = Go2Side("lo", domain)
+        self.robot = SimRobot(xml, self.side.joint_order, RATE)
         self.damps_since: float | None = None
         self.begun = 0.0
         self._change: Callable[[SimRobot], Any] | None = None
@@ -137,7 +142,7 @@ class Robot:
         if self._change:
             self._change(self.robot)
             self.begun, self._change = time.monotonic(), None
-        received = self._side.receive()
+        received = self.side.receive()
         command = received.newest
         self.robot.step(received)
         if isinstance(command, MotorCommand) and (command.kp.any() or command.tau.any()):
@@ -146,9 +151,7 @@ class Robot:
             self.damps_since = time.monotonic()
         state, is_damaged = self.robot.says()
         if state is not None:
-            message = encode_state(state)
-            message.crc ^= int(is_damaged)
-            self._side.publish(message)
+            self.side.send(state, is_damaged)
 
 
 def on_its_feet(robot: SimRobot) -> None:
@@ -158,7 +161,7 @@ def on_its_feet(robot: SimRobot) -> None:
 
 
 def trial(name: str, side: Robot, pipe: Connection, pid: int, rng: np.random.Generator) -> dict[str, Any] | None:
-    """Inject a fault, and return what came of it; nothing if the robot was stopped before."""
+    """Inject a fault, and return what came of it; nothing if something else had stopped the robot before."""
 
     def tell(word: str) -> tuple[float, Any]:
         """Tell the program, and return when it did what, and its answer."""
@@ -173,7 +176,7 @@ def trial(name: str, side: Robot, pipe: Connection, pid: int, rng: np.random.Gen
     time.sleep(0.15)
     refused = tell(Mode.STAND.value)[1]
     time.sleep(STAND_UP + 0.05)
-    walks = name in OF_PROGRAM[:2] or rng.random() < 0.7
+    walks = name in OF_POLICY or rng.random() < 0.7
     refused = refused or (walks and tell(Mode.POLICY.value)[1])
     time.sleep(rng.uniform(0.02, 0.6))
     if refused or side.damps_since is not None:
@@ -187,13 +190,17 @@ def trial(name: str, side: Robot, pipe: Connection, pid: int, rng: np.random.Gen
     else:
         begun, _ = tell(name)
     end = time.monotonic() + LIMIT
-    while side.damps_since is None and time.monotonic() < end:
-        time.sleep(1e-3)
-    os.kill(pid, signal.SIGCONT)
-    ended = side.damps_since
-    if name.startswith("policy"):
+    try:
+        while side.damps_since is None and time.monotonic() < end:
+            time.sleep(1e-3)
+        ended, excess = side.damps_since, side.robot.excess
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    if name in OF_POLICY:
         begun = tell("asked")[1]
-    return {"fault": name, "walks": walks, "ms": ended and 1e3 * (ended - begun), "excess": side.robot.excess}
+    if begun is None or (ended is not None and ended < begun):
+        return None
+    return {"fault": name, "walks": walks, "ms": ended and 1e3 * (ended - begun), "excess": excess}
 
 
 def main() -> None:
@@ -210,36 +217,50 @@ def main() -> None:
     description, rng = Policy(args.export).description, np.random.default_rng(args.seed)
     if (name := description["robot"]["name"]) != "go2":
         raise UserError(f"the policy is of the robot '{name}'; only a 'go2' can be simulated over DDS")
-    rows: list[dict[str, Any]] = []
-    rate = default_rate(description["timing"]["control_frequency"])
-    (pipe, theirs), side = mp.Pipe(), Robot(resource_path(description["robot"]["file"]))
-    process = mp.get_context("spawn").Process(target=program, args=(args.export, rate, theirs), daemon=True)
+    rate, domain = default_rate(description["timing"]["control_frequency"]), 2 + os.getpid() % 90
+    side, (pipe, theirs) = Robot(resource_path(description["robot"]["file"]), domain), mp.Pipe()
+    process = mp.get_context("spawn").Process(target=program, args=(args.export, domain, rate, theirs), daemon=True)
     process.start()
     theirs.close()  # so that its end is noticed
-    stopped = 0
-    with (
-        StopRequest(lambda text: None) as stop,
-        RealTimeLoop(RATE, side.tick),
-        Counter("faults", args.trials) as counter,
-    ):
-        while len(rows) < args.trials and not stop.requested:
-            row = trial(KINDS[len(rows) % len(KINDS)], side, pipe, process.pid or 0, rng)
-            if row:
-                rows.append(row)
-                counter.add()
-            else:
-                stopped += 1
-        pipe.send("end")
-    process.join()
+    rows: list[dict[str, Any]] = []
+    stopped = in_a_row = 0
+    try:
+        with (
+            StopRequest(lambda text: None) as stop,
+            RealTimeLoop(RATE, side.tick) as loop,
+            Counter("faults", args.trials) as counter,
+        ):
+            while len(rows) < args.trials and not stop.requested and loop.error is None:
+                assert process.pid
+                row = trial(KINDS[len(rows) % len(KINDS)], side, pipe, process.pid, rng)
+                stopped, in_a_row = stopped + (row is None), 0 if row else in_a_row + 1
+                if in_a_row == GIVE_UP:
+                    raise UserError(f"{GIVE_UP} times in a row the robot was stopped before its fault")
+                if row:
+                    rows.append(row)
+                    counter.add()
+            pipe.send("end")
+        process.join(10.0)
+        if loop.error is not None:
+            raise loop.error
+    finally:
+        side.side.close()
+        result = {"policy": description["task"], "commands_per_s": rate, "stopped_before": stopped, "rows": rows}
+        report(result, args.json)
+
+
+def report(result: dict[str, Any], file: Path | None) -> None:
+    """Print a table, and write a file if there is one."""
+    rows = result["rows"]
     for kind in KINDS:
         of = [row for row in rows if row["fault"] == kind]
         times = sorted(row["ms"] or np.inf for row in of) or [np.nan]
         excess = max((row["excess"] for row in of), default=np.nan)
         print(f"{kind:22} {len(of):4}  {times[len(times) // 2]:5.1f}, at most {times[-1]:5.1f} ms  {excess:6.3g} N m")
+    rate, stopped = result["commands_per_s"], result["stopped_before"]
     print(f"{stopped} times the robot was stopped before its fault, {len(rows)} faults, {rate:g} commands a second")
-    if args.json:
-        result = {"policy": description["task"], "commands_per_s": rate, "stopped_before": stopped, "rows": rows}
-        write_json(args.json, result | {"versions": package_versions()})
+    if file:
+        write_json(file, result | {"versions": package_versions()})
 
 
 if __name__ == "__main__":

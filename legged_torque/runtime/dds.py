@@ -185,6 +185,8 @@ class Go2Side(_Side):
             self._service_writer.write(self.sport_mode.answer(request))
         return received
 
-    def send(self, state: RobotState) -> None:
-        """Tell the program; raises MessageError if a number is not finite."""
-        self.publish(unitree_go2.encode_state(state))
+    def send(self, state: RobotState, is_damaged: bool = False) -> None:
+        """Tell the program, with a wrong checksum if asked to; raises MessageError if a number is not finite."""
+        message = unitree_go2.encode_state(state)
+        message.crc ^= is_damaged
+        self.publish(message)

@@ -100,7 +100,6 @@ def conditions():
 MEASURED = {"undisturbed": ("as trained", "track_percentage"), "torques change": ("as trained", "torque_rate")}
 MEASURED |= {"noise x 4": ("noise 4 times", "track_percentage"), "falls, dead leg": ("dead leg", "falls_per_minute")}
 MEASURED |= {"peak force [N]": ("drop 50 cm", "peak_force")}
-DAMPED = {"default torque": "damping, history", "PD": "tuned"}
 """Condition and metric of columns; others are tracking in the condition of their name."""
 
 
@@ -131,7 +130,9 @@ def test_other_conditions(conditions):
     one = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").max()
     assert f"falls more than {drops.max():.1f} times a minute, one training of the combination {one:.1f} times" in text
     peaks = of.xs("drop 50 cm", level="condition").xs("peak_force", level="metric")
-    recipe, tuned = (peaks[trained_as(f"{name}, 20 ms, {how}")] for name, how in DAMPED.items())
+    recipe, tuned = (
+        peaks[trained_as(policy)] for policy in ("default torque, 20 ms, damping, history", "PD, 20 ms, tuned")
+    )
     assert f"{1 - recipe.mean() / tuned.mean():.0%} below tuned PD's (p = {welch(recipe, tuned):.3f})" in text
     base = text_of("results.md", "- **Trained with ideal motors**")
     ideal = of["ideal motors, no latency"].xs("track_percentage", level="metric")
