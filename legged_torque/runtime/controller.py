@@ -119,13 +119,22 @@ class Controller:
     # ---- a tick ------------------------------------------------------------------------------------------------------
 
     def step(self, received: Received, now: float, missed: bool = False) -> MotorCommand:
-        """Return the command of a tick at a time [s], of what was received since the last, which may be ``missed``."""
+        """Return the command of a tick at a time [s], of what was received since the last; ``missed``: it is late."""
         with self._lock:
             self.policy_step = None
             try:
                 self.sent = self._step(received, now, missed)
             except Exception as error:  # whatever it is, the robot must not be left without a command
                 self.stop(str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}")
+                self.sent = self._gentle(self.brakes.damping)
+            return self.sent
+
+    def command_at(self, now: float) -> MotorCommand:
+        """Return the command of the tick to send at a time [s]: damping if it is too late by then."""
+        with self._lock:
+            missed = self._missed + (now - self._now > self.period)
+            if self.mode in (Mode.STAND, Mode.POLICY) and (problem := self._lateness(now, missed)):
+                self.stop(problem)
                 self.sent = self._gentle(self.brakes.damping)
             return self.sent
 
@@ -158,11 +167,15 @@ class Controller:
         """Return why the robot must not move."""
         if self.state is None:
             return "the robot has not said anything yet"
-        allowed = self.brakes.max_slow if self._missed > 1 else self.brakes.max_missed
-        if (late := self._now - self._on_time) > allowed + 1e-6:
-            return f"all deadlines of {1e3 * late:.0f} ms were missed"
+        if problem := self._lateness(self._now, self._missed):
+            return problem
         seen = Received(None, self._damaged, problems=self._problems)
         return fault(self.state, self._now - self._state_time, seen, self.joints, self.brakes)
+
+    def _lateness(self, now: float, missed: int) -> str:
+        """Return why it is too late for a command at a time [s], after so many missed deadlines in a row."""
+        late, allowed = now - self._on_time, self.brakes.max_slow if missed > 1 else self.brakes.max_missed
+        return f"all deadlines of {1e3 * late:.0f} ms were missed" if late > allowed + 1e-6 else ""
 
     def _gentle(self, damping: float) -> MotorCommand:
         """Return a command without targets, whose damping is within the limits at the last known speeds."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-MISSED = 0.5  # of a period: a tick that ends this much after its deadline has missed it
+MISSED = 0.5  # of a period: a tick that begins this much after its time has missed it
 BIN, BINS = 1e-5, 5000  # of the histogram of lateness: width [s], and number; the last one is for all that is later
 PRIORITY = 20  # of real-time scheduling, 1 to 99
 SWITCH = 1e-4  # seconds after which another thread gives way to the loop; Python's default is 5 ms
@@ -28,7 +28,7 @@ class RealTimeLoop:
     error: BaseException | None = None
 
     def __init__(self, rate: float, tick: Callable[[float, bool], None]) -> None:
-        """Prepare to call ``tick`` with the time [s] and whether the deadline before was missed, ``rate`` a second."""
+        """Prepare to call ``tick`` with the time [s] and whether it is late, ``rate`` a second."""
         self._period, self._tick, self._ended = 1.0 / rate, tick, threading.Event()
         self._histogram = np.zeros(BINS, np.int64)
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
@@ -60,20 +60,17 @@ class RealTimeLoop:
 
     def _run(self) -> None:
         """Tick until the end."""
-        due, missed = time.monotonic(), False
+        due = time.monotonic()
         try:
             while not self._ended.is_set():
+                time.sleep(max(due - time.monotonic(), 0.0))
                 begin = time.monotonic()
-                self._histogram[min(int((begin - due) / BIN), BINS - 1)] += 1
+                late = begin - due
+                missed = late > MISSED * self._period  # the tick before took too long, or the machine was halted
+                self._histogram[min(int(late / BIN), BINS - 1)] += 1
                 self.ticks += 1
+                due = (begin if missed else due) + self._period  # what was missed is not caught up
                 self._tick(begin, missed)
-                due += self._period
-                left = due - time.monotonic()
-                missed = left < -MISSED * self._period
-                if missed:
-                    due = time.monotonic()  # what was missed is not caught up
-                else:
-                    time.sleep(max(left, 0.0))
         except BaseException as error:
             self.error = error
 

@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from legged_torque.runtime.controller import Controller, Mode
@@ -20,9 +21,18 @@ class Session:
         log: Where the ticks are kept; None if nowhere.
     """
 
-    def __init__(self, controller: Controller, transport: Transport, log: Any = None) -> None:
-        """Prepare; nothing is sent yet. ``log``, a :class:`~legged_torque.runtime.log.Log`, gets every tick."""
-        self.controller, self._transport, self.log = controller, transport, log
+    def __init__(
+        self,
+        controller: Controller,
+        transport: Transport,
+        log: Any = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Prepare; nothing is sent yet. ``log``, a :class:`~legged_torque.runtime.log.Log`, gets every tick.
+
+        ``clock`` returns the time [s] that ticks are given: a test's robot has a time of its own.
+        """
+        self.controller, self._transport, self.log, self._clock = controller, transport, log, clock
         self.counts: Counter[str] = Counter()
         self.stops: list[str] = []
 
@@ -32,7 +42,8 @@ class Session:
         new = {"messages": int(received.newest is not None), "damaged": received.wrong_crc}
         self.counts.update(new | {"lost": received.lost, "late": received.late, "missed deadlines": int(missed)})
         before = self.controller.reason
-        self._transport.send(self.controller.step(received, now, missed))
+        self.controller.step(received, now, missed)
+        self._transport.send(self.controller.command_at(self._clock()))
         if self.controller.reason and self.controller.reason != before:
             self.stops.append(self.controller.reason)
         if self.log:
@@ -43,7 +54,7 @@ class Session:
         self.controller.request(Mode.DAMPING)
         end = time.monotonic() + FAREWELL
         while time.monotonic() < end:
-            self.tick(time.monotonic(), missed=False)
+            self.tick(self._clock(), missed=False)
             time.sleep(self.controller.period)
         self._transport.close()
         if self.log:

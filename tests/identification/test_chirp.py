@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.exports import export_random
 from support.settings import error_of
+from support.simulated import Simulated
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
@@ -12,7 +13,6 @@ from legged_torque.runtime import chirp
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import Log, RecordedLog
-from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
 
 RATE, SECONDS = 500.0, 6.0
@@ -46,7 +46,7 @@ def test_hanging_robot(policy, tmp_path):
     sweeps = chirp.Chirp(policy, RATE, SECONDS)
     robot = SimRobot(resource_path(policy.description["robot"]["file"]), policy.joint_order, RATE, hangs=True)
     controller = Controller(sweeps, policy.joint_order, RATE)
-    session = Session(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
+    session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
     for tick in range(1700 + round(SECONDS * RATE) + 1):
         session.tick(tick / RATE, missed=False)
         if tick in (5, 1700):

@@ -1,10 +1,14 @@
 """The control of a robot, in step with a simulated one: what drives do, standing up, walking, faults of all kinds."""
 
+import os
+import subprocess
+import time
+
 import numpy as np
 import pytest
 from support.control import JOINTS
 from support.exports import export_random
-from support.simulated import RATE, World
+from support.simulated import RATE, World, standing_at_once
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
@@ -12,6 +16,7 @@ from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.runtime.loop import RealTimeLoop
 from legged_torque.runtime.sim_robot import Faults, SimRobot
 from legged_torque.utils.errors import UserError
 
@@ -178,6 +183,32 @@ def test_every_fault_ends_in_damping(policy):
         if mend:
             mend()
     assert world.robot.excess <= 1e-6
+
+
+def test_commands_that_are_late_are_not_sent(policy):
+    """A tick that takes long, or the second of two that are late, ends in damping before it sends its command."""
+    world = World(policy).stand()
+    for missed, took in ((False, 0.013), (True, 0.005)):
+        world.took = took
+        assert world.run(1, missed) == Mode.STAND and world.robot.says()[0] is not None
+        world.took = took + 0.002
+        assert world.run(1, missed) == Mode.DAMPING and not world.controller.sent.kp.any()
+        world.took = 0.0
+        world.run(1)
+        assert world.controller.request(Mode.STAND) == ""
+
+
+def test_a_halt_between_two_ticks_is_noticed(policy):
+    """The operating system may halt the program while it waits for its next tick."""
+    world = standing_at_once(policy)
+    assert world.controller.request(Mode.STAND) == ""
+    world.controller.brakes = Brakes(max_missed=0.2, max_slow=0.2)
+    with RealTimeLoop(RATE / 10, world.tick) as loop:
+        time.sleep(0.1)
+        assert (world.controller.mode, loop.ticks > 0) == (Mode.STAND, True)
+        subprocess.run(["sh", "-c", f"kill -STOP {os.getpid()}; sleep 0.5; kill -CONT {os.getpid()}"], check=True)
+        time.sleep(0.1)
+    assert world.controller.mode == Mode.DAMPING and "deadlines" in world.controller.reason
 
 
 def test_missed_deadlines_and_a_dead_program(policy):

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from support.exports import export_random
 from support.settings import error_of
-from support.simulated import RATE, robot_of
+from support.simulated import RATE, Simulated, robot_of
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.replay import same_actions, simulate
-from legged_torque.runtime.session import Session
 
 STAND, WALK = 1700, 150  # ticks of each
 DEAD = STAND + 60  # tick at which a motor dies
@@ -26,7 +25,7 @@ def recorded(policy, tmp_path_factory):
     """A log of standing up and a policy, in which a motor dies; all that was said and sent; a copy of it not closed."""
     robot, folder = robot_of(policy), tmp_path_factory.mktemp("logs")
     wire, controller = InProcess(robot), Controller(policy, policy.joint_order, RATE)
-    session, seen = Session(controller, wire, Log(folder / "log.mcap", controller)), []
+    session, seen = Simulated(controller, wire, Log(folder / "log.mcap", controller)), []
     step = controller.step
     controller.step = lambda received, *args: (seen.append((received.newest, step(received, *args))), seen[-1][1])[1]
     for tick in range(STAND + WALK):
@@ -93,7 +92,7 @@ def test_mistakes(policy, recorded, tmp_path, monkeypatch):
 def test_full_disk(policy, tmp_path):
     """The robot goes on without its log, which says so and can be read as far as it goes."""
     wire, controller = InProcess(robot_of(policy)), Controller(policy, policy.joint_order, RATE)
-    session, limits = Session(controller, wire, Log(tmp_path / "log.mcap", controller)), getrlimit(RLIMIT_FSIZE)
+    session, limits = Simulated(controller, wire, Log(tmp_path / "log.mcap", controller)), getrlimit(RLIMIT_FSIZE)
     setrlimit(RLIMIT_FSIZE, (300_000, limits[1]))
     try:
         for tick in range(1000):

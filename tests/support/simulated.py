@@ -15,7 +15,25 @@ def robot_of(policy, order=None, **options):
     return SimRobot(resource_path(policy.description["robot"]["file"]), order or policy.joint_order, RATE, **options)
 
 
-class World(Session):
+class Simulated(Session):
+    """A session in simulated time.
+
+    Attributes:
+        took: Seconds from the beginning of a tick until its command is sent.
+    """
+
+    now = took = 0.0
+
+    def __init__(self, *args):
+        super().__init__(*args, clock=lambda: self.now + self.took)
+
+    def tick(self, now, missed):
+        """A tick of that time."""
+        self.now = now
+        super().tick(now, missed)
+
+
+class World(Simulated):
     """A robot, its controller, and the time in ticks."""
 
     def __init__(self, policy, brakes=None):

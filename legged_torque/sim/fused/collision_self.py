@@ -19,7 +19,7 @@ from legged_torque.sim.fused.collision_primitive import (
     sphere_sphere,
 )
 from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
-from legged_torque.sim.fused.math import group_sum, quat_to_matrix
+from legged_torque.sim.fused.math import group_sum, quat_to_matrix, sum_before, sync_group
 from legged_torque.sim.fused.model import Model, of_world
 from legged_torque.sim.fused.smooth import Pose
 from legged_torque.sim.fused.tree import Tree
@@ -43,10 +43,13 @@ class SelfContacts:
     pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
     pair_solref: wp.array2d(dtype=wp.vec2)
     pair_solimp: wp.array2d(dtype=vec5)
+    geom: wp.array(dtype=wp.int32)  # all geoms of pairs
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
     # Scratch:
     poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
+    sphere: wp.array2d(dtype=vec4)  # (geom, world): centre and radius; worlds last, so that threads read neighbours
+    near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs whose spheres overlap, in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
     pushing: wp.array(dtype=vec4)
@@ -88,6 +91,9 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     airborne = np.setdiff1d(pairs, on_ground)
     out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
     out.geom_place = wp.array(tree.geom_places, dtype=wp.vec2i)
+    out.geom = wp.array(np.unique(pairs), dtype=wp.int32)
+    out.sphere = wp.empty((model.ngeom, worlds), dtype=vec4)
+    out.near = wp.empty((len(pairs), worlds), dtype=wp.int32)
     out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
     room = worlds * MAX_SELF_CONTACTS
     out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
@@ -133,11 +139,41 @@ def reach_of(model: Model, world: int, geom: int) -> float:
 
 
 @wp.func
-def are_near(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+def write_spheres(model: Model, selves: SelfContacts, world: int, thread: int, threads: int):
+    """Write a sphere around each geom, from the trunk's origin; each thread has every so many geoms."""
+    for i in range(thread, selves.geom.shape[0], threads):
+        geom = selves.geom[i]
+        middle = middle_of(model, selves, world, geom)
+        selves.sphere[geom, world] = vec4(middle[0], middle[1], middle[2], reach_of(model, world, geom))
+
+
+@wp.func
+def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
     """Return whether spheres around two geoms overlap."""
-    apart = middle_of(model, selves, world, geoms[1]) - middle_of(model, selves, world, geoms[0])
-    reach = reach_of(model, world, geoms[0]) + reach_of(model, world, geoms[1])
+    first, second = selves.sphere[geoms[0], world], selves.sphere[geoms[1], world]
+    apart = wp.vec3(second[0] - first[0], second[1] - first[1], second[2] - first[2])
+    reach = first[3] + second[3]
     return wp.length_sq(apart) <= reach * reach
+
+
+@wp.func
+def write_near(selves: SelfContacts, world: int, thread: int, threads: int) -> int:
+    """Write the pairs of a world whose spheres overlap, and return their number.
+
+    Few are near, and shapes take the most code: threads that search apart would wait for each other at each of them.
+    """
+    end = int(0)
+    for start in range(0, selves.pair.shape[0], threads):
+        is_near = float(0.0)
+        if start + thread < selves.pair.shape[0]:
+            is_near = wp.where(are_near(selves, world, selves.pair[start + thread]), 1.0, 0.0)
+        new = int(group_sum(is_near, threads))
+        if new > 0:
+            place = end + int(sum_before(is_near, thread, threads))
+            if is_near > 0.0:
+                selves.near[place, world] = start + thread
+            end += new
+    return end
 
 
 _COLLIDE: dict[tuple[int, int], wp.Function] = {
@@ -183,29 +219,30 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
         selves.first = world * MAX_SELF_CONTACTS
         last = selves.first + MAX_SELF_CONTACTS
         end = selves.first + 0
-        for start in range(0, selves.pair.shape[0], wp.static(threads)):
+        write_spheres(model, selves, world, thread, wp.static(threads))
+        sync_group(wp.static(threads))
+        near = write_near(selves, world, thread, wp.static(threads))
+        sync_group(wp.static(threads))
+        for start in range(0, near, wp.static(threads)):
             touch = PairContacts()
-            geoms = wp.vec2i(0, 0)
-            if start + thread < selves.pair.shape[0]:
-                geoms = selves.pair[start + thread]
-                if are_near(model, selves, world, geoms):
-                    first, second = model.geom_type[geoms[0]], model.geom_type[geoms[1]]
-                    a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-                    for i in range(wp.static(len(kinds))):
-                        if first == wp.static(kinds[i][0]) and second == wp.static(kinds[i][1]):
-                            touch = wp.static(_COLLIDE[kinds[i]])(a, b)
+            pair, geoms = int(0), wp.vec2i(0, 0)
+            if start + thread < near:
+                pair = selves.near[start + thread, world]
+                geoms = selves.pair[pair]
+                first, second = model.geom_type[geoms[0]], model.geom_type[geoms[1]]
+                a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+                for i in range(wp.static(len(kinds))):
+                    if first == wp.static(kinds[i][0]) and second == wp.static(kinds[i][1]):
+                        touch = wp.static(_COLLIDE[kinds[i]])(a, b)
             new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
-                place = end + 0
-                for other in range(wp.static(threads - 1)):  # threads before this one write first
-                    found = group_sum(wp.where(thread == other, float(touch.count), 0.0), wp.static(threads))
-                    place += wp.where(other < thread, int(found), 0)
+                place = end + int(sum_before(float(touch.count), thread, wp.static(threads)))
                 for i in range(touch.count):
                     if place + i < last:
                         selves.geoms[place + i] = geoms
                         selves.normal[place + i] = touch.normal[i]
                         selves.found[place + i] = make_self_contact(
-                            model, selves, world, start + thread, touch.dist[i], touch.pos[i], touch.normal[i]
+                            model, selves, world, pair, touch.dist[i], touch.pos[i], touch.normal[i]
                         )
                 end += new
         if end > last and thread == 0:

@@ -21,6 +21,16 @@ def group_sum(value: float, threads: int) -> float:
     ...
 
 
+@wp.func
+def sum_before(value: float, thread: int, threads: int) -> float:
+    """Return the sum of a value over the threads of a world that come before this one."""
+    before = float(0.0)
+    for other in range(threads - 1):
+        of_other = group_sum(wp.where(thread == other, value, 0.0), threads)
+        before += wp.where(other < thread, of_other, 0.0)
+    return before
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const unsigned first = (threadIdx.x & 31u) & ~(unsigned(threads) - 1u);
