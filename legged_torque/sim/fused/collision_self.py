@@ -11,6 +11,7 @@ from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
 from legged_torque.sim.fused.collision_primitive import (
     PairContacts,
     Shape,
+    axis_of,
     box_box,
     capsule_box,
     capsule_capsule,
@@ -28,6 +29,8 @@ from legged_torque.utils.mjcf import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
 """Most contacts of a world between parts of its robot. Further ones are dropped and reported in ``overflow``."""
+AT_ONCE = wp.constant(8)
+"""Pairs that a thread looks at before all threads of its world say what they have found."""
 SPHERE = wp.constant(2)
 """MuJoCo's mjGEOM_SPHERE."""
 OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
@@ -157,22 +160,43 @@ def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
 
 
 @wp.func
-def write_near(selves: SelfContacts, world: int, thread: int, threads: int) -> int:
-    """Write the pairs of a world whose spheres overlap, and return their number.
+def is_beside(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether a sphere or capsule lies beyond one of the faces of a box; False for other pairs."""
+    beside = bool(False)
+    if model.geom_type[geoms[1]] == BOX and model.geom_type[geoms[0]] != BOX:
+        round, box = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+        apart, axis = wp.transpose(box.rot) * (round.pos - box.pos), wp.transpose(box.rot) * axis_of(round)
+        outside = wp.abs(apart) - wp.abs(axis) - box.size
+        beside = wp.max(outside) > round.size[0]
+    return beside
 
-    Few are near, and shapes take the most code: threads that search apart would wait for each other at each of them.
+
+@wp.func
+def write_near(model: Model, selves: SelfContacts, world: int, thread: int, threads: int) -> int:
+    """Write the pairs of a world that may touch, in order, and return their number.
+
+    Few are near, and contacts take the most code: threads that search apart would wait for each other at each of them.
     """
     end = int(0)
-    for start in range(0, selves.pair.shape[0], threads):
-        is_near = float(0.0)
-        if start + thread < selves.pair.shape[0]:
-            is_near = wp.where(are_near(selves, world, selves.pair[start + thread]), 1.0, 0.0)
-        new = int(group_sum(is_near, threads))
-        if new > 0:
-            place = end + int(sum_before(is_near, thread, threads))
-            if is_near > 0.0:
-                selves.near[place, world] = start + thread
-            end += new
+    for start in range(0, selves.pair.shape[0], AT_ONCE * threads):
+        near = int(0)  # a bit for each pair of this thread
+        for i in range(AT_ONCE):
+            pair = start + i * threads + thread
+            if pair < selves.pair.shape[0]:
+                if are_near(selves, world, selves.pair[pair]):
+                    near += 1 << i
+        if group_sum(float(near), threads) > 0.0:
+            i = int(0)
+            while i < AT_ONCE:  # not unrolled
+                pair = start + i * threads + thread
+                may_touch = float(0.0)
+                if (near >> i) % 2 == 1:
+                    may_touch = wp.where(is_beside(model, selves, world, selves.pair[pair]), 0.0, 1.0)
+                place = end + int(sum_before(may_touch, thread, threads))
+                if may_touch > 0.0:
+                    selves.near[place, world] = pair
+                end += int(group_sum(may_touch, threads))
+                i += 1
     return end
 
 
@@ -221,7 +245,7 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
         end = selves.first + 0
         write_spheres(model, selves, world, thread, wp.static(threads))
         sync_group(wp.static(threads))
-        near = write_near(selves, world, thread, wp.static(threads))
+        near = write_near(model, selves, world, thread, wp.static(threads))
         sync_group(wp.static(threads))
         for start in range(0, near, wp.static(threads)):
             touch = PairContacts()
