@@ -63,9 +63,12 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
         head_hidden_dims: Sizes = [128]  # of either head
 
     def presets(self) -> dict[str, dict[str, Any]]:
-        """Return those of other approaches; on a laptop, heads are small and the PD part fades once the robot walks."""
+        """Return those of other approaches; on a laptop, heads are small and the PD part fades once the robot walks.
+
+        It has faded before ``algorithm.annealing_start`` makes steps too small to learn without it.
+        """
         named = super().presets()
-        laptop, fading = named["laptop"], {"t_start": 9_000_000, "t_end": 16_000_000}
+        laptop, fading = named["laptop"], {"t_start": 4_000_000, "t_end": 10_000_000}
         laptop["actor"] |= {"head_hidden_dims": [64]}
         laptop["runner"] |= {"walks_after": 3_000_000}  # the latest of four seeds of the A1, docs/results/laptop.csv.gz
         laptop["control"] = {"mixing": {"pd": fading}}

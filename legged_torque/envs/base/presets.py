@@ -14,7 +14,8 @@ def standard_presets() -> dict[str, dict[str, Any]]:
 
 def laptop() -> dict[str, Any]:
     """Return settings with which a robot walks soon on a CPU: few worlds, small networks, a short training."""
-    sizes = {"env": {"num_envs_cpu": 128}, "runner": {"total_steps": 20_000_000}, "algorithm": {"lam": 0.9}}
+    steps = {"gamma": 0.97, "lam": 0.9, "desired_kl": 0.03}
+    sizes = {"env": {"num_envs_cpu": 128}, "runner": {"total_steps": 20_000_000}, "algorithm": steps}
     networks = {name: {"hidden_dims": [128, 128]} for name in ("actor", "critic")}
     return {"linear_changes": 0.3, **sizes, **networks, "evaluation": {"interval": 500_000, "num_samples": 16_000}}
 
