@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from legged_torque.utils.devices import disable_renderer
 
 disable_renderer()  # before anything imports mujoco
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -26,6 +27,7 @@ from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.sim.engine import Engine, HeightMap
 from legged_torque.sim.model import FLOOR, build_model
 from legged_torque.sim.registry import ENGINES, make_engine
+from legged_torque.sim.warp_engine import WarpEngine
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name
 from legged_torque.utils.limits import Count
@@ -212,7 +214,7 @@ class Accuracy:
     iterations: float  # mean of the solver's
 
 
-def measure_accuracy(sim: Engine, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
+def measure_accuracy(sim: WarpEngine, state: PhysicsState, expected: np.ndarray, comparable: np.ndarray) -> Accuracy:
     """Compare one step of a simulator with as many worlds with a :func:`reference_step`; not finite is wrong."""
     for name, values in state.items():
         getattr(sim, name).copy_(values)
@@ -330,7 +332,8 @@ def main() -> None:
     run = task_registry.load_run(options)
     set_seed(args.seed)
     env, walking_states = walk(run, options, args.steps)
-    limits, ground, sims, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, {}, None
+    limits, ground, pose = (env.cfg.sim.solver_iterations, env.cfg.sim.ls_iterations), env.terrain.map, None
+    sims: dict[str, Any] = {}
     for name, engine in ENGINES.items():
         height_map = ground if "height_map" in engine.capabilities else None
         model = open_motors(load_asset(env.cfg, None if height_map else env.terrain).mj_model)

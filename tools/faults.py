@@ -11,6 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
@@ -90,17 +91,18 @@ def program(export: Path, domain: int, rate: float, pipe: Connection) -> None:
 
     def mend() -> None:
         """Let all work again."""
-        policy.session, controller.brakes.max_tilt, transport.receive = network, Brakes.max_tilt, receive
+        policy.session, controller.brakes.max_tilt = network, Brakes.max_tilt
+        vars(transport).pop("receive", None)
 
     words: dict[str, Callable[[], Any]] = {
         "policy not finite": lambda: answer(np.nan),
         "policy out of range": lambda: answer(1e6),
         "error in the program": lambda: setattr(controller.brakes, "max_tilt", "a mistake"),
-        "late ticks": lambda: setattr(transport, "receive", late),
+        "late ticks": lambda: vars(transport).update(receive=late),
         "operator": lambda: controller.request(Mode.DAMPING),
         "asked": lambda: asked[0] if asked else None,
         "mend": mend,
-        **{mode.value: lambda mode=mode: controller.request(mode) for mode in (Mode.STAND, Mode.POLICY)},
+        **{mode.value: partial(controller.request, mode) for mode in (Mode.STAND, Mode.POLICY)},
     }
     with RealTimeLoop(rate, Session(controller, transport).tick) as loop:
         while loop.error is None and (word := pipe.recv()) != "end":
@@ -132,14 +134,14 @@ class Robot:
         """Have a function called before the next physics step, and wait for it."""
         self._change = function
         end = time.monotonic() + 10.0
-        while self._change:
+        while self._change is not None:
             time.sleep(1e-4)
             if time.monotonic() > end:
                 raise TimeoutError("the robot's loop has ended")
 
     def tick(self, now: float, missed: bool) -> None:
         """Obey, move, and tell the state."""
-        if self._change:
+        if self._change is not None:
             self._change(self.robot)
             self.begun, self._change = time.monotonic(), None
         received = self.side.receive()

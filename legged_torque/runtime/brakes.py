@@ -18,7 +18,7 @@ class Brakes:
     max_overrun: float = 0.1  # of a joint beyond its range [rad]
     max_temperature: float = 90.0  # of a motor [deg C]
     max_damaged: int = 3  # messages with a wrong checksum since the last whole one
-    max_missed: float = 0.014  # seconds of one tick, as when the program is halted in it
+    max_missed: float = 0.014  # seconds of one late tick, as when the program is halted
     max_slow: float = 0.008  # seconds in which every deadline of several ticks was missed
     torque_rate: float = 2000.0  # most by which a torque changes [N m/s]
     ramp: float = 0.5  # seconds in which a policy takes over from standing

@@ -50,7 +50,7 @@ class RealTimeLoop:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """End after the present tick."""
+        """End after at most one more tick."""
         self._ended.set()
         self._thread.join()
         sys.setswitchinterval(self._switch)

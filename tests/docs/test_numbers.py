@@ -1,6 +1,7 @@
 """The tables of the documents, recomputed from the raw data beside them."""
 
 import json
+import math
 import re
 from itertools import product
 
@@ -288,6 +289,8 @@ def test_performance():
     both, one = (two[f"{name}_steps_per_s"] for name in ("two_gpus", "one_gpu"))
     text = text_of("performance.md", "- **Two GPUs**")
     assert f"make {both / 1e6:.1f} million steps/s, {both / one:.2f} times those of one" in text
+    more = [two["worlds_16384"][f"{name}_steps_per_s"] for name in ("two_gpus", "one_gpu")]
+    assert f"two GPUs make {more[0] / 1e6:.1f} million, also {more[0] / more[1]:.2f} times" in text
     stages = ("updates", "logs and checkpoints", "end")
     more = [two["two_gpus"][name] - two["one_gpu"][name] for name in stages]
     said = "take {:.1f} s more, logs and checkpoints, with the worlds of both processes, {:.1f} s, the end {:.1f} s"
@@ -312,6 +315,20 @@ def test_performance():
     assert "after {:.0f} s on MuJoCo Warp (288b895), and {:.1f} and {:.1f} s with".format(*seconds) in text
 
 
+def test_self_collision():
+    """Times of physics steps by worlds and what robots do, without contacts between parts and with two commits'."""
+    data = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
+    rows = pd.DataFrame(next(each["rows"] for each in data if each["what"].startswith("physics steps of an A1")))
+    times = rows[rows["self_collision"]].set_index(["worlds", "robots", "commit"])["us"]
+    none = rows[~rows["self_collision"]].groupby(["worlds", "robots"])["us"].mean()
+    _, said = rows_of("performance.md", "worlds | robots | without")
+    assert len(said) == 4
+    for worlds, robots, *cells in said:
+        key = int(worlds), robots
+        expected = [none[key], *(times[(*key, commit)] for commit in ("fba2b3b", "e41b3c4"))]
+        assert [f"{us:.0f}" for us in expected] == cells, key
+
+
 def test_faults():
     """Longest times until faults ended in damping, how often each was tried, and torques beyond limits."""
     data, page = pd.read_csv(DOCS / "results" / "faults.csv.gz"), "howto/run_on_robot.md"
@@ -325,6 +342,8 @@ def test_faults():
         assert [f"{of[rate]:.0f}" for rate in (50, 200)] == times
     most = data[~data["fault"].str.startswith("joint")].groupby("policy_hz")["excess"].max()
     assert f"up to {most[200]:.0f} N m beyond limits at 200 Hz" in text_of(page, "## Brakes") and most[50] < 1e-3
+    late = data[data["fault"] == "late ticks"]["ms"].sort_values()
+    assert f"all but one ended within {math.ceil(late.iloc[-2])} ms" in text_of(page, "## Brakes")
 
 
 def test_kernels_of_an_update():
@@ -342,50 +361,3 @@ def test_kernels_of_an_update():
             assert same(text, sum(each["us"] for each in kernels)), (name, when)
         bound = data["bound_us"].get(names.get(name))
         assert numbers[2] == (f"{bound:.0f}" if bound else ""), name
-
-
-def test_few_worlds():
-    """Mean and latest of the steps after which evaluations track 70%, and how many seeds come there."""
-    data = pd.read_csv(DOCS / "results" / "laptop_settings.csv.gz").fillna({"other": ""})
-    columns = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
-    walking = data[data["track_percentage"] >= 0.7].groupby([*columns, "task", "seed"])["steps"].min() / 1e6
-    header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 5 and data[columns].drop_duplicates().shape[0] == 38
-    for size, batches, epochs, *cells, _ in rows:
-        shape, *others = (
-            size.replace("lambda ", "lam=")
-            .replace("gamma ", "gamma=")
-            .replace("desired KL ", "desired_kl=")
-            .split(", ")
-        )
-        setting = (*map(int, shape.split(" x ")), int(batches), int(epochs), " ".join(others))
-        for task, cell in zip(header[3:-1], cells, strict=True):
-            steps = walking.loc[(*setting, task.strip("`"))]
-            mean, latest = cell.partition(" (")[0].split(", ")
-            assert same(mean, steps.mean()) and same(latest, steps.max()), (size, task, steps)
-            assert cell[len(f"{mean}, {latest}") :] == ("" if len(steps) == 4 else f" ({len(steps)})")
-    go2 = walking.xs("go2_torque_multihead", level="task").groupby("other")
-    text = text_of("tried.md", "For the Go2 alone")
-    for other, words in (
-        ("again", "again: "),
-        ("stiffness=30", "stiffness of 30 gave "),
-        ("stiffness=25", "of 25 "),
-        ("torque_scale=8", "`torque_scale` 8 "),
-        ("action_scale=0.35", "`action_scale` 0.35 "),
-        ("init_std=0.7", "`init_std` 0.7 "),
-        ("desired_kl=0.03 stiffness=30", "desired KL 0.03 "),
-    ):
-        steps = go2.get_group(f"lam=0.9 gamma=0.97 {other}")
-        assert f"{words}{steps.mean():.1f}, {steps.max():.1f}" in text and len(steps) == 4, other
-
-
-def test_laptop():
-    """Minutes of training on two cores until an evaluation tracks 70%."""
-    data = pd.read_csv(DOCS / "results" / "laptop.csv.gz")
-    seconds = data[data["track_percentage"] >= 0.7].groupby(["task", "seed"])["seconds"].min()
-    text = text_of("getting_started.md", "On two cores of a virtual machine")
-    texts = {task: [f"{s // 60:.0f}:{s % 60:02.0f}" for s in times] for task, times in seconds.groupby("task")}
-    first, second, third, fourth = texts["a1_torque_multihead"]
-    assert f"after {first}, {second}, {third} and {fourth} minutes of training (seeds 1 to 4)" in text
-    assert "`a1_position` after {}, {}, {} and {}, at most".format(*texts["a1_position"]) in text
-    assert "seeds 1 to 3, after {}, {} and {} (ad0b145;".format(*texts["go2_torque_multihead"]) in text

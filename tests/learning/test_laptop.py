@@ -81,6 +81,14 @@ def test_curricula_are_shorter(steps):
     torch.testing.assert_close(values["laptop"], values["parallel"])
 
 
+@pytest.mark.parametrize("preset", ["parallel", "laptop"])
+def test_the_pd_part_fades_in_time(preset):
+    """A policy has to learn to walk without it while annealing has not made its steps small."""
+    env_cfg, train_cfg = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", preset=preset))
+    steps, fading = train_cfg.runner.total_steps, env_cfg.control.mixing.pd
+    assert fading.t_start < fading.t_end <= train_cfg.algorithm.annealing_start * steps
+
+
 def test_when_it_walks(capsys):
     """The time until it walks is that of the steps which are left at this speed, as long as it does not walk."""
     clock, shown = Clock(), ["walks in about 3 min", "walks later than others did", "tracking 0.750"]

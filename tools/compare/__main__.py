@@ -99,7 +99,7 @@ def parse_args() -> argparse.Namespace:
 def install(folder: Path) -> Path:
     """Make an environment for mjlab, and return its Python."""
     python = folder / "bin" / "python"
-    for words in ([sys.executable, "-m", "venv", folder], [python, "-m", "pip", "install", "-q", MJLAB]):
+    for words in ([sys.executable, "-m", "venv", str(folder)], [str(python), "-m", "pip", "install", "-q", MJLAB]):
         if subprocess.run(words, check=False).returncode:
             raise UserError(f"an environment with {MJLAB} could not be made, see above; --mjlab names one that has it")
     return python

@@ -63,14 +63,14 @@ class MultiHeadCfgPPO(LeggedRobotCfgPPO):
         head_hidden_dims: Sizes = [128]  # of either head
 
     def presets(self) -> dict[str, dict[str, Any]]:
-        """Return those of other approaches; on a laptop, heads are small and the PD part fades once the robot walks.
+        """Return those of other approaches; on a laptop, heads are small and the PD part fades earlier.
 
-        It has faded before ``algorithm.annealing_start`` makes steps too small to learn without it.
+        An A1 on two cores walks before it fades, and ``algorithm.annealing_start`` makes steps small afterwards.
         """
         named = super().presets()
         laptop, fading = named["laptop"], {"t_start": 4_000_000, "t_end": 10_000_000}
         laptop["actor"] |= {"head_hidden_dims": [64]}
-        laptop["runner"] |= {"walks_after": 3_000_000}  # the latest of four seeds of the A1, docs/results/laptop.csv.gz
+        laptop["runner"] |= {"walks_after": 4_000_000}  # the latest of twelve seeds of the A1, docs/tried.md
         laptop["control"] = {"mixing": {"pd": fading}}
         return named
 

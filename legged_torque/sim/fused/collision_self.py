@@ -52,7 +52,7 @@ class SelfContacts:
     # Scratch:
     poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
     sphere: wp.array2d(dtype=vec4)  # (geom, world): centre and radius; worlds last, so that threads read neighbours
-    near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs whose spheres overlap, in order
+    near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
     pushing: wp.array(dtype=vec4)
@@ -143,7 +143,7 @@ def reach_of(model: Model, world: int, geom: int) -> float:
 
 @wp.func
 def write_spheres(model: Model, selves: SelfContacts, world: int, thread: int, threads: int):
-    """Write a sphere around each geom, from the trunk's origin; each thread has every so many geoms."""
+    """Write a sphere around each geom, from the trunk's origin; the threads take turns."""
     for i in range(thread, selves.geom.shape[0], threads):
         geom = selves.geom[i]
         middle = middle_of(model, selves, world, geom)
@@ -161,13 +161,16 @@ def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
 
 @wp.func
 def is_beside(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
-    """Return whether a sphere or capsule lies beyond one of the faces of a box; False for other pairs."""
+    """Return whether a sphere or capsule lies beyond one of the faces of a box; False for other pairs.
+
+    A sphere counts as a capsule, which is longer if the file gives it a second size.
+    """
     beside = bool(False)
     if model.geom_type[geoms[1]] == BOX and model.geom_type[geoms[0]] != BOX:
-        round, box = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-        apart, axis = wp.transpose(box.rot) * (round.pos - box.pos), wp.transpose(box.rot) * axis_of(round)
+        shape, box = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+        apart, axis = wp.transpose(box.rot) * (shape.pos - box.pos), wp.transpose(box.rot) * axis_of(shape)
         outside = wp.abs(apart) - wp.abs(axis) - box.size
-        beside = wp.max(outside) > round.size[0]
+        beside = wp.max(outside) > shape.size[0]
     return beside
 
 
@@ -183,8 +186,7 @@ def write_near(model: Model, selves: SelfContacts, world: int, thread: int, thre
         for i in range(AT_ONCE):
             pair = start + i * threads + thread
             if pair < selves.pair.shape[0]:
-                if are_near(selves, world, selves.pair[pair]):
-                    near += 1 << i
+                near += wp.where(are_near(selves, world, selves.pair[pair]), 1 << i, 0)
         if group_sum(float(near), threads) > 0.0:
             i = int(0)
             while i < AT_ONCE:  # not unrolled
