@@ -6,6 +6,10 @@ import numpy as np
 import pandas as pd
 from support.documents import DOCS, rows_of, same, text_of
 
+from legged_torque.envs import task_registry
+from legged_torque.utils.options import Options
+
+NEW = "4980b63"  # with the settings of today
 KEPT = "lam=0.9 gamma=0.97 desired_kl=0.03"
 SETTINGS = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
 
@@ -73,31 +77,36 @@ def test_whole_trainings_of_few_worlds():
     assert f"ends at {lowest['a1_position']:.2f} to {highest['a1_position']:.2f};" in text
 
 
-def test_few_worlds_of_a_go2():
-    """The same numbers with other gains, scales and noise."""
-    _, walking = laptop_settings()
-    go2 = walking.xs("go2_torque_multihead", level="task").groupby("other")
-    text = text_of("tried.md", "For the Go2 alone")
-    for other, words in (
-        ("again", "again: "),
-        ("stiffness=30", "stiffness of 30 gave "),
-        ("stiffness=25", "of 25 "),
-        ("torque_scale=8", "`torque_scale` 8 "),
-        ("action_scale=0.35", "`action_scale` 0.35 "),
-        ("init_std=0.7", "`init_std` 0.7 "),
-        ("desired_kl=0.03 stiffness=30", "desired KL 0.03 "),
-    ):
-        steps = go2.get_group(f"lam=0.9 gamma=0.97 {other}")
-        assert f"{words}{steps.mean():.1f}, {steps.max():.1f}" in text and len(steps) == 4, other
+def after(seconds):
+    """Minutes and seconds, as the documents write them."""
+    return [f"{s // 60:.0f}:{s % 60:02.0f}" for s in seconds]
 
 
 def test_laptop():
-    """Minutes of training on two cores until an evaluation tracks 70%."""
+    """Minutes of training on two cores until evaluations track 70 and 80%, and tracking at the end."""
     data = pd.read_csv(DOCS / "results" / "laptop.csv.gz")
-    seconds = data[data["track_percentage"] >= 0.7].groupby(["task", "seed"])["seconds"].min()
+    new, of = data[data["commit"] == NEW], ["task", "seed"]
+    before = data[(data["commit"] != NEW) & (data["track_percentage"] >= 0.7)].groupby(of)["seconds"].min()
     text = text_of("getting_started.md", "On two cores of a virtual machine")
-    texts = {task: [f"{s // 60:.0f}:{s % 60:02.0f}" for s in times] for task, times in seconds.groupby("task")}
-    first, second, third, fourth = texts["a1_torque_multihead"]
-    assert f"after {first}, {second}, {third} and {fourth} minutes of training (seeds 1 to 4)" in text
-    assert "`a1_position` after {}, {}, {} and {}, at most".format(*texts["a1_position"]) in text
-    assert "seeds 1 to 3, after {}, {} and {} (ad0b145;".format(*texts["go2_torque_multihead"]) in text
+    first, second, third, fourth = after(before["a1_torque_multihead"])
+    assert f"70% took {first}, {second}, {third} and {fourth} (A1, seeds 1 to 4)" in text
+    assert "{}, {} and {} (Go2, seeds 1 to 3)".format(*after(before["go2_torque_multihead"])) in text
+    assert "since, {}, {}, {} and {} (d9348b7".format(*after(before["a1_position"])) in text
+    walks, soon = (new[new["track_percentage"] >= share].groupby(of)["seconds"].min() for share in (0.7, 0.8))
+    times = [
+        after(seconds[task]) for task in ("a1_torque_multihead", "go2_torque_multihead") for seconds in (walks, soon)
+    ]
+    whole = new[(new["task"] == "a1_torque_multihead") & (new["seed"] == 1)]
+    end = whole[whole["steps"] > 0.82 * 20e6]["track_percentage"].mean()
+    assert "after {} and {} minutes of training, 80% after {} and {};".format(*times[0], *times[1]) in text
+    assert f"seed 1 tracked {end:.2f} in the last 18%" in text
+    said = "70% after {}, {} and {}, 80% after {}, {} and {};".format(*times[2], *times[3])
+    assert said in text and len(times[2]) == len(times[3]) == 3
+    assert f"tracks {end:.2f} at the end" in text_of("tried.md", "**At the end of 20 million")
+
+
+def test_fading():
+    """The PD part fades when the page says so."""
+    fading = task_registry.get_cfgs("a1_torque_multihead", Options(device="cpu", preset="laptop"))[0].control.mixing.pd
+    said = f"fades between {fading.t_start / 1e6:.0f} and {fading.t_end / 1e6:.0f} million steps"
+    assert said in text_of("getting_started.md", "The preset `laptop` has")
