@@ -140,7 +140,8 @@ class TrainingDisplay(Display):
             entries["steps/s"] = f"{speed * self._steps:,.0f}"
             if self._walks_after and max(self._tracking, default=0.0) < WALKING:
                 seconds = (self._walks_after - self._env_steps) / (speed * self._steps)
-                entries["walks"] = f"in about {seconds / 60:.0f} min" if seconds > 0.0 else "later than others did"
+                if seconds > 0.0 or self._tracking:  # a resumed training may walk already
+                    entries["walks"] = f"in about {seconds / 60:.0f} min" if seconds > 0.0 else "later than others did"
         entries |= {name: form.format(numbers[key]) for key, (name, form) in _SHOWN.items() if key in numbers}
         if self._tracking:
             entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"

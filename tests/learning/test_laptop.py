@@ -90,15 +90,23 @@ def test_the_pd_part_fades_in_time(preset):
 
 
 def test_when_it_walks(capsys):
-    """The time until it walks is that of the steps which are left at this speed, as long as it does not walk."""
+    """The time until it walks is that of the steps which are left at this speed, as long as it does not walk.
+
+    A training that was resumed after these steps is not late before an evaluation says so.
+    """
     clock, shown = Clock(), ["walks in about 3 min", "walks later than others did", "tracking 0.750"]
     measured = {"Evaluation/falls_per_minute": 0.0}
     with TrainingDisplay("title", "folder", 1000, 0, 1000, clock=clock, walks_after=250_000) as display:
         for i in range(1, 301):
             clock.sleep(1.0)  # 1000 steps per second
-            tracking = {"Evaluation/track_percentage": 0.75, **measured} if i == 300 else {}
-            display.add_iteration(i, 1000 * i, tracking)
+            tracking = {200: {"Evaluation/track_percentage": 0.5}, 300: {"Evaluation/track_percentage": 0.75}}
+            display.add_iteration(i, 1000 * i, {**tracking[i], **measured} if i in tracking else {})
     lines = capsys.readouterr().out.splitlines()
     for line, text in zip((lines[6], lines[26], lines[-1]), shown, strict=True):  # after 61, 261 and 300 s
         assert text in line
     assert "walks" not in lines[-1]
+    with TrainingDisplay("title", "folder", 1000, 0, 1000, clock=clock, walks_after=250_000) as display:
+        for i in range(30):
+            clock.sleep(1.0)
+            display.add_iteration(i + 1, 1000 * i + 300_000, {})
+    assert "steps/s" in (output := capsys.readouterr().out) and "walks" not in output
