@@ -96,13 +96,14 @@ def test_laptop():
     times = [
         after(seconds[task]) for task in ("a1_torque_multihead", "go2_torque_multihead") for seconds in (walks, soon)
     ]
-    whole = new[(new["task"] == "a1_torque_multihead") & (new["seed"] == 1)]
-    end = whole[whole["steps"] > 0.82 * 20e6]["track_percentage"].mean()
+    last = new[(new["steps"] > 0.82 * 20e6) & (new["seed"] == 1)].groupby("task")["track_percentage"]
+    assert (last.size() == 8).all()
+    ends = [f"{end:.2f}" for end in last.mean()]
     assert "after {} and {} minutes of training, 80% after {} and {};".format(*times[0], *times[1]) in text
-    assert f"seed 1 tracked {end:.2f} in the last 18%" in text
+    assert f"seed 1 tracked {ends[0]} in the last 18%" in text and f"steps, {ends[1]} in the last 18%" in text
     said = "70% after {}, {} and {}, 80% after {}, {} and {};".format(*times[2], *times[3])
     assert said in text and len(times[2]) == len(times[3]) == 3
-    assert f"tracks {end:.2f} at the end" in text_of("tried.md", "**At the end of 20 million")
+    assert "tracks {} (A1) and {} (Go2) at the end".format(*ends) in text_of("tried.md", "**At the end of 20 million")
 
 
 def test_fading():
