@@ -16,7 +16,7 @@ SETTINGS = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
 
 def laptop_settings():
     """What was tried for the preset laptop, and after how many million steps each run tracked 70%."""
-    data = pd.read_csv(DOCS / "results" / "laptop_settings.csv.gz").fillna({"other": ""})
+    data = pd.read_csv(DOCS / "results" / "laptop_settings.csv.xz").fillna({"other": ""})
     return data, data[data["track_percentage"] >= 0.7].groupby([*SETTINGS, "task", "seed"])["steps"].min() / 1e6
 
 
