@@ -10,10 +10,8 @@ from legged_torque.utils.task_registry import set_seed
 
 TASK = "a1_torque_multihead"
 SHORT = ["--preset=laptop", "--num_envs=1024", "--set=algorithm.lam=0.95", "--set=algorithm.gamma=0.98"]
-SHORT += [
-    "--set=algorithm.desired_kl=0.02",
-    *(f"--set=control.mixing.pd.t_{end}000000" for end in ("start=9", "end=16")),
-]
+SHORT += ["--set=algorithm.desired_kl=0.02", "--set=control.mixing.pd.t_start=9000000"]
+SHORT += ["--set=control.mixing.pd.t_end=16000000"]
 LATE = ["motors.delay.range=[0,20]", "motors.delay.unit=milliseconds", "sensing.delay.range=[0,1]"]
 STEPS = 400  # of a measurement
 

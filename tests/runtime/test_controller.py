@@ -205,14 +205,14 @@ def test_a_halt_between_two_ticks_is_noticed():
     code += "with RealTimeLoop(20.0, lambda *tick: ticks.append(tick)):\n"
     code += "    print('ready', flush=True); sys.stdin.readline()\n"
     code += "print(*(f'{now} {missed:d}' for now, missed in ticks), sep='\\n')"
-    program = subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, text=True)
-    assert program.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    program.send_signal(signal.SIGSTOP)
-    time.sleep(0.5)
-    program.send_signal(signal.SIGCONT)
-    time.sleep(0.2)
-    ticks = np.array([line.split() for line in program.communicate("\n")[0].splitlines()], float)
+    with subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, text=True) as program:
+        assert program.stdout.readline() == "ready\n"
+        time.sleep(0.3)
+        program.send_signal(signal.SIGSTOP)
+        time.sleep(0.5)
+        program.send_signal(signal.SIGCONT)
+        time.sleep(0.2)
+        ticks = np.array([line.split() for line in program.communicate("\n")[0].splitlines()], float)
     longest = np.diff(ticks[:, 0]).argmax()
     assert ticks[longest + 1, 0] - ticks[longest, 0] > 0.4 and ticks[longest + 1, 1] and not ticks[0, 1]
 
