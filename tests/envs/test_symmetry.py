@@ -121,31 +121,22 @@ def normal_log_prob(actions, mean, std):
 
 
 @pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
-@pytest.mark.parametrize("replaces_half", [False, True])
-def test_losses_of_an_update(make_runner, name, replaces_half, monkeypatch):
+def test_losses_of_an_update(make_runner, name):
     """By hand: policy and value are also learned from images; the divergence is that of the originals alone."""
-    settings = {"algorithm.use_clipped_value_loss": False, "algorithm.symmetry_cfg.replaces_half": replaces_half}
-    runner = make_runner(name, **settings)
+    runner = make_runner(name, **{"algorithm.use_clipped_value_loss": False})
     alg, batch = runner.alg, roll_out(runner)
-    kept, images = (slice(0, SAMPLES // 2), slice(SAMPLES // 2, SAMPLES)) if replaces_half else (slice(0, SAMPLES),) * 2
-    monkeypatch.setattr(torch, "randperm", lambda size, device: torch.arange(size, device=device))
-
-    def of_both(values):
-        """What belongs to samples that stay, and to those that have images."""
-        return torch.cat([values[kept], values[images]])
-
     seen = {group: batch.observations[group] for group in ("policy", "critic")}
-    both = {group: torch.cat([values[kept], BY_HAND[group](values[images])]) for group, values in seen.items()}
-    actions = torch.cat([batch.actions[kept], mirror_joints(batch.actions[images])])
-    obs = TensorDict(both, [len(actions)])
+    both = {group: torch.cat([values, BY_HAND[group](values)]) for group, values in seen.items()}
+    obs, actions = TensorDict(both, [2 * SAMPLES]), torch.cat([batch.actions, mirror_joints(batch.actions)])
     old_mean, std = (values.clone() for values in batch.old_distribution_params)
-    means, old_means = alg.actor(obs).detach(), of_both(old_mean)
-    kl, image_kl = (0.5 * ((means - old_means) / std[:1]) ** 2).sum(dim=1).view(2, -1).mean(dim=1)
+    means = alg.actor(obs).detach()
+    kl, image_kl = ((0.5 * ((mean - old_mean) / std) ** 2).sum(dim=1).mean() for mean in means.split(SAMPLES))
     assert abs(image_kl - kl) > 0.01 * kl
-    old_log_prob, advantages = of_both(batch.old_actions_log_prob.flatten()), of_both(batch.advantages.flatten())
-    ratio = torch.exp(normal_log_prob(actions, means, std[:1]) - old_log_prob)
+    old_log_prob = batch.old_actions_log_prob.flatten().repeat(2)
+    advantages = batch.advantages.flatten().repeat(2)
+    ratio = torch.exp(normal_log_prob(actions, means, std.repeat(2, 1)) - old_log_prob)
     surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(0.8, 1.2)).mean()
-    value = (alg.critic(obs).detach() - of_both(batch.returns)).square().mean()
+    value = (alg.critic(obs).detach() - batch.returns.repeat(2, 1)).square().mean()
     losses = alg.update()
     assert losses["skipped_updates"] == 0.0
     assert losses["kl"] == pytest.approx(float(kl), rel=1e-4)
@@ -154,13 +145,12 @@ def test_losses_of_an_update(make_runner, name, replaces_half, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["a1_torque", "a1_torque_multihead"])
-@pytest.mark.parametrize(("augmentation", "replaces_half"), [(True, False), (True, True), (False, True)])
-def test_losses_on_a_cpu(make_runner, name, augmentation, replaces_half):
-    """They and their gradients are those of torch's operations, for a third of the samples in any order."""
-    settings = {"algorithm.num_mini_batches": 3, "algorithm.symmetry_cfg.replaces_half": replaces_half}
-    runner = make_runner(name, augmentation=augmentation, **settings)
+@pytest.mark.parametrize("augmentation", [True, False])
+def test_losses_on_a_cpu(make_runner, name, augmentation):
+    """They and their gradients are those of torch's operations, for half of the samples in any order."""
+    runner = make_runner(name, augmentation=augmentation, **{"algorithm.num_mini_batches": 2})
     roll_out(runner)
-    runner.alg.indices.copy_(torch.randperm(SAMPLES)[: SAMPLES // 3])
+    runner.alg.indices.copy_(torch.randperm(SAMPLES)[: SAMPLES // 2])
     found = []
     for kind in (CpuPPO, TorchPPO):
         runner.alg.optimizer.zero_grad()
@@ -181,12 +171,6 @@ class Symmetrized(nn.Module):
     def forward(self, obs):
         """Return actions that are mirrored when observations are."""
         return 0.5 * (self.network(obs) + mirror_joints(self.network(mirror_policy(obs))))
-
-
-def test_mirror_loss_needs_all_images(make_runner):
-    """With half of them it is refused."""
-    with pytest.raises(UserError, match="use_mirror_loss needs the images of all samples, replaces_half=false"):
-        make_runner(loss=True, **{"algorithm.symmetry_cfg.replaces_half": True})
 
 
 @pytest.mark.parametrize("augmentation", [True, False])

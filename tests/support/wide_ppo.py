@@ -31,17 +31,7 @@ class Mirrored:
         self.mirror.maps = self.maps
 
 
-def build(
-    kind,
-    device="cpu",
-    multi_head=False,
-    symmetric=False,
-    replaces_half=False,
-    seed=0,
-    std_type="log",
-    sizes=WIDE,
-    **settings,
-):
+def build(kind, device="cpu", multi_head=False, symmetric=False, seed=0, std_type="log", sizes=WIDE, **settings):
     """An algorithm of a kind, which gets actor, critic, storage and settings."""
     torch.manual_seed(seed)
     distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
@@ -53,7 +43,7 @@ def build(
     if symmetric:
         function = "legged_torque.envs.base.symmetry:with_mirror_images"
         settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
-        settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored(device), "replaces_half": replaces_half}
+        settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored(device)}
     return kind(actor, critic, storage, **{**SETTINGS, "device": device, **settings})
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from rsl_rl.extensions import Symmetry
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map
@@ -18,7 +19,6 @@ from legged_torque.learning.flashsac.exploration import RepeatedNoise
 from legged_torque.learning.flashsac.networks import FlashSACActor, FlashSACCritic, bound_weights
 from legged_torque.learning.flashsac.replay import Batch, Replay
 from legged_torque.learning.flashsac.returns import RewardScale, lower_of, projected
-from legged_torque.learning.mirror_images import MirrorImages
 from legged_torque.learning.protocols import Transition
 from legged_torque.sim.compiled import compiled
 from legged_torque.sim.graph import CudaGraph
@@ -44,7 +44,7 @@ class FlashSAC:
         log_temperature: Logarithm of the weight of the entropy.
         replay: Past steps.
         reward_scale: What rewards are divided by.
-        symmetry: Adds mirror images to samples, or None.
+        symmetry: rsl_rl's extension that adds mirror images to samples, or None.
         num_updates: Gradient steps so far.
         graphs: The gradient steps with and without the actor.
         uses_bfloat16: Whether losses multiply matrices of bfloat16 numbers; all else is float32.
@@ -61,7 +61,7 @@ class FlashSAC:
         settings: dict[str, Any],
         gamma: float,
         steps_per_rollout: int,
-        symmetry: MirrorImages | None = None,
+        symmetry: Symmetry | None = None,
     ) -> None:
         """Create the learner.
 
@@ -116,7 +116,7 @@ class FlashSAC:
         critic = FlashSACCritic(obs, groups, "critic", env.num_actions, largest, **settings["critic"]).to(device)
         kept, dtype = {*actor.obs_groups, *critic.obs_groups}, getattr(torch, settings["buffer_obs_dtype"])
         replay = Replay(obs, sorted(kept), env.num_actions, settings["replay_buffer_size"], dtype, device)
-        symmetry = MirrorImages(env, **mirroring) if mirroring["use_data_augmentation"] else None
+        symmetry = Symmetry(env, **mirroring) if mirroring["use_data_augmentation"] else None
         alg = cls(actor, critic, replay, settings, algorithm["gamma"], cfg["num_steps_per_env"], symmetry)
         for graph in alg.graphs.values():
             graph.enabled = cfg["capture"]
@@ -215,8 +215,9 @@ class FlashSAC:
         batch = self.replay.sample(self.settings["mini_batch_size"], self.settings["n_steps"], self.gamma)
         if self.symmetry is None:
             return batch
-        obs, actions = self.symmetry.add(batch.obs, batch.actions)
-        next_obs, _ = self.symmetry.add(batch.next_obs, None)
+        env, add_images = self.symmetry.env, self.symmetry.data_augmentation_func
+        obs, actions = add_images(env=env, obs=batch.obs, actions=batch.actions)
+        next_obs, _ = add_images(env=env, obs=batch.next_obs, actions=None)
         times = len(obs) // len(batch.obs)
         rewards, discounts, weights = (part.repeat(times) for part in (batch.rewards, batch.discounts, batch.weights))
         return Batch(obs, actions, rewards, discounts, next_obs, weights)

@@ -31,10 +31,9 @@ class CpuPPO(TorchPPO):
 
     def loss(self) -> tuple[Tensor, Tensor]:
         """Return what :meth:`TorchPPO.loss` does, up to rounding."""
-        behind = self.storage.actions[..., 0].numel()  # the images are behind the rollout
-        images = self.num_samples // self.batch_size
-        parts = self.indices.split(self.num_originals) if images == 1 else [self.indices] * images
-        places = torch.cat([indices + part * behind for part, indices in enumerate(parts)])
+        originals = self.storage.actions[..., 0].numel()
+        images = len(self._samples[-1]) // originals
+        places = torch.cat([self.indices + image * originals for image in range(images)])
         seen, critic_seen, actions = (values.index_select(0, places) for values in self._samples)
         means, distribution = run_network(self.actor.mlp, seen), self.actor.distribution
         distribution.update(means[:1])

@@ -11,7 +11,6 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
-from legged_torque.learning.mirror_images import MirrorImages
 from legged_torque.learning.protocols import Transition
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
@@ -33,8 +32,6 @@ class TorchPPO(PPO):
     rsl_rl, each normalizes the advantages of its own rollout.
 
     Attributes:
-        num_originals: Samples of a minibatch that are no mirror images; they come first.
-        num_samples: Samples of a minibatch, with mirror images.
         warm_up_iterations: Iterations at the start of a training in which only the critic learns.
         update_graph: The update from the samples of ``indices``.
         product_dtype: Numbers that matrix products take; those of float32 may be TF32.
@@ -67,18 +64,15 @@ class TorchPPO(PPO):
         if actor.is_recurrent or critic.is_recurrent:
             raise UserError(f"{type(self).__name__} does not support recurrent models")
         symmetry = kwargs.pop("symmetry_cfg", None)
-        super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         if symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
-            self.symmetry: MirrorImages | None = MirrorImages(**symmetry)
+            kwargs["symmetry_cfg"] = symmetry
+        super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         self.batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
         if self.batch_size < 1:
             raise UserError(
                 f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
                 f"({storage.num_envs} worlds x {storage.num_transitions_per_env} steps)"
             )
-        self.num_originals = self.num_samples = self.batch_size
-        if self.symmetry:
-            self.num_originals, self.num_samples = self.symmetry.sizes(self.batch_size)
         self.learning_rates = (MIN_LEARNING_RATE, max_learning_rate)
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
         self.annealing_start, self._first_rate = annealing_start, learning_rate
@@ -238,9 +232,8 @@ class TorchPPO(PPO):
         log_prob = self.actor.get_output_log_prob(batch.actions)
         entropy = self.actor.output_entropy.mean()
         with torch.no_grad():  # from the policy that acted, without mirror images
-            kinds = (batch.old_distribution_params, self.actor.output_distribution_params)
-            old, new = (tuple(params[: self.num_originals] for params in kind) for kind in kinds)
-            kl = self.actor.get_kl_divergence(old, new).mean()
+            params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
+            kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
         ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze(1))
         advantages = batch.advantages.squeeze(1)
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)

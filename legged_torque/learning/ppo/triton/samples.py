@@ -12,19 +12,16 @@ NUMBERS = 1024  # that it reads at most, where a sample has not more
 
 @triton.jit
 def observe(
-    observations, indices, order, signs, values, place, stride, first_column, num_originals, shift, num_samples, size,
+    observations, indices, order, signs, values, place, stride, first_column, num_chosen, num_samples, size,
     CHOOSE: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Write the observations of chosen samples, mirror images, and zeros; of all samples without ``CHOOSE``.
-
-    From ``num_originals`` on, sample i is the image of that of index i - ``shift``.
-    """
+    """Write the observations of chosen samples, their mirror images, and zeros; of all samples without ``CHOOSE``."""
     samples = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     columns = tl.arange(0, COLUMNS)
     used = (samples < num_samples)[:, None] & (columns < size)[None, :]
     if CHOOSE:
-        is_image = (samples >= num_originals)[:, None]
-        among_chosen = tl.where(samples >= num_originals, samples - shift, samples)
+        is_image = (samples >= num_chosen)[:, None]
+        among_chosen = tl.where(samples >= num_chosen, samples - num_chosen, samples)
         chosen = tl.load(indices + among_chosen, mask=samples < num_samples, other=0)
         mirrored = tl.load(order + columns, mask=columns < size, other=0)
         sign = tl.load(signs + columns, mask=columns < size, other=0.0)
@@ -104,7 +101,7 @@ def squared_error(value, first, target, clip, CLIP_VALUES: tl.constexpr):
 @triton.jit
 def losses(
     outputs, std_parameter, low, high, old_std, indices, order, signs, actions, means, log_probs, values, advantages,
-    returns, actor_learns, gradients, places, strides, sums, sums_stride, num_originals, shift, num_samples, size,
+    returns, actor_learns, gradients, places, strides, sums, sums_stride, num_chosen, num_samples, size,
     clip, value_weight, entropy_weight, IS_LOG: tl.constexpr, CLIP_VALUES: tl.constexpr, ROWS: tl.constexpr,
     COLUMNS: tl.constexpr,
 ):  # fmt: skip
@@ -112,14 +109,14 @@ def losses(
 
     Sums: value loss, surrogate loss, entropy, KL divergence of the samples that are no mirror images, then the
     gradients by the parameters of the standard deviations, and by each output.
-    ``places`` and ``strides``: where the gradient by each output belongs. Images are as in :func:`observe`.
+    ``places`` and ``strides``: where the gradient by each output belongs.
     """
     samples = tl.program_id(0) * ROWS + tl.arange(0, ROWS)
     columns = tl.arange(0, COLUMNS)
     is_action, is_sample = columns < size, samples < num_samples
     used = is_sample[:, None] & is_action[None, :]
-    is_image = samples >= num_originals
-    chosen = tl.load(indices + tl.where(is_image, samples - shift, samples), mask=is_sample, other=0)
+    is_image = samples >= num_chosen
+    chosen = tl.load(indices + tl.where(is_image, samples - num_chosen, samples), mask=is_sample, other=0)
     mirrored = tl.load(order + columns, mask=is_action, other=0)
     sign = tl.load(signs + columns, mask=is_action, other=0.0)
     source = tl.where(is_image[:, None], mirrored[None, :], columns[None, :])
@@ -146,7 +143,7 @@ def losses(
 
     old_mean = tl.load(means + chosen[:, None] * size + columns[None, :], mask=used, other=0.0)
     old = tl.load(old_std + columns, mask=is_action, other=1.0)
-    kl = tl.sum(tl.where(used & (samples < num_originals)[:, None], divergence(old_mean, old, mean, std), 0.0))
+    kl = tl.sum(tl.where(used & (samples < num_chosen)[:, None], divergence(old_mean, old, mean, std), 0.0))
 
     value = tl.load(outputs + samples * (size + 1) + size, mask=is_sample, other=0.0)
     first = tl.load(values + chosen, mask=is_sample, other=0.0)
@@ -164,7 +161,7 @@ def losses(
     tl.store(out, tl.sum(tl.where(is_sample, value_loss, 0.0)) / num_samples)
     tl.store(out + 1, tl.sum(tl.where(is_sample, tl.maximum(surrogate, clipped), 0.0)) / num_samples)
     tl.store(out + 2, entropy)
-    tl.store(out + 3, kl / num_originals)
+    tl.store(out + 3, kl / num_chosen)
     tl.store(out + 4 + columns, by_std, mask=is_action)
     tl.store(out + 4 + size + columns, tl.sum(by_mean, 0), mask=is_action)
     tl.store(out + 4 + 2 * size, tl.sum(by_value))

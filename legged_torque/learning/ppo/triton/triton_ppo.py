@@ -58,7 +58,8 @@ class TritonPPO(TorchPPO):
         size = storage.actions.shape[-1]
         networks = (read_network(actor.mlp), read_network(critic.mlp, size))
         self._std = self._deviation_settings()
-        sizes = (self.num_samples, storage.num_envs)
+        self._num_samples = self.batch_size * (2 if self.symmetry else 1)
+        sizes = (self._num_samples, storage.num_envs)
         self._memory = Memory(self._models, networks, self._std[0], self.product_dtype, *sizes)
         self._places = self._memory.output_places()
         flat = self._memory.flat
@@ -186,7 +187,7 @@ class TritonPPO(TorchPPO):
         for i, group in enumerate(groups):
             order, signs = maps[i] if maps else (group, group)
             target = (memory.place(inputs), inputs.block.width, column)
-            counts = (*self._image_places(), self.num_samples if maps else len(group), group.shape[1])
+            counts = (self.batch_size, self._num_samples if maps else len(group), group.shape[1])
             columns = triton.next_power_of_2(group.shape[1])
             rows = max(1, min(samples.ROWS, samples.NUMBERS // columns))
             samples.observe[(num_rows // rows,)](
@@ -215,7 +216,7 @@ class TritonPPO(TorchPPO):
         size = storage.actions.shape[-1]
         policy = (storage.actions, self._means, storage.actions_log_prob)
         values = (storage.values, storage.advantages, storage.returns)
-        counts = (*self._image_places(), self.num_samples, size)
+        counts = (self.batch_size, self._num_samples, size)
         weights = (self.clip_param, self.value_loss_coef, self.entropy_weight)
         sums = memory.loss_sums
         samples.losses[(len(sums),)](
@@ -259,10 +260,6 @@ class TritonPPO(TorchPPO):
             self._scalars, self.learning_rate, memory.actor_size, size,
             beta1, beta2, group["eps"], decay, BLOCK=steps.BLOCK,
         )  # fmt: skip
-
-    def _image_places(self) -> tuple[int, int]:
-        """Return the first mirror image of a minibatch, and how far its sample is from that of the same index."""
-        return self.num_originals, self.num_samples - self.batch_size
 
     def _mirror_map(self, name: str) -> tuple[Tensor, Tensor]:
         """Return order and signs of the mirror image of observations or actions; without images, of no change."""
