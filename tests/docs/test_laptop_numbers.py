@@ -37,7 +37,7 @@ def test_few_worlds():
     """Mean and latest of the steps after which evaluations track 70%, and how many seeds come there."""
     data, walking = laptop_settings()
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 6 and data[SETTINGS].drop_duplicates().shape[0] == 46
+    assert len(rows) == 6 and data[SETTINGS].drop_duplicates().shape[0] == 54
     seeds = data.groupby([*SETTINGS, "task"])["seed"].nunique()
     for size, batches, epochs, *cells, _ in rows:
         shape, _, others = size.partition(", ")
@@ -61,8 +61,8 @@ def test_few_worlds():
 def test_whole_trainings_of_few_worlds():
     """Tracking at the end, and that all had learned to walk before."""
     data, _ = laptop_settings()
-    whole = data[data["other"].str.endswith("20M")].groupby(["other", "task", "seed"])
-    ends = whole.apply(lambda run: run[run["steps"] > 0.82 * run["steps"].max()]["track_percentage"].mean())
+    whole = data[data["other"].str.endswith(("0.9 20M", "3 20M"))].groupby(["other", "task", "seed"])
+    ends = whole.apply(at_the_end)
     assert (whole["track_percentage"].max() >= 0.8).all() and len(ends) == 36
     kinds = [ends[ends.index.get_level_values("task").str.endswith("multihead")].groupby("other"), ends.groupby("task")]
     (low, high), (lowest, highest) = ((kind.min(), kind.max()) for kind in kinds)
@@ -75,6 +75,37 @@ def test_whole_trainings_of_few_worlds():
     assert f"tracked {said['lam=0.9']} (torque" in text and f"the kept row {said[KEPT]}, with gamma" in text
     assert f"gamma 0.96 {said['0.96']}, with 0.95 {said['0.95']};" in text
     assert f"ends at {lowest['a1_position']:.2f} to {highest['a1_position']:.2f};" in text
+
+
+def at_the_end(run):
+    """Mean tracking in the last 18% of a run."""
+    return run[run["steps"] > 0.82 * run["steps"].max()]["track_percentage"].mean()
+
+
+def test_half_of_the_mirror_images():
+    """How many times the steps to 70% they take, and what is lost at the end, of laptop and default preset."""
+    data, walking = laptop_settings()
+    today = f"{KEPT} fade 4-10M"
+    whole, half = (walking.loc[256, 24].xs(name, level="other") for name in (today, f"{today} half images"))
+    runs = [(task, seed) for task in data["task"].unique()[:3] for seed in range(5, 11)]
+    ratios = {}
+    for kind in half.index.droplevel(["task", "seed"]).unique():
+        steps = (np.log(of.loc[place].reindex(runs).fillna(7.5)) for of, place in ((half, kind), (whole, (4, 5))))
+        ratios[kind] = float(np.exp(np.subtract(*steps).mean()))
+    text = text_of("tried.md", "**Mirror images in place")
+    few = [ratios[batches, 5] for batches in (2, 3, 4)]
+    assert {f"{ratio:.1f}" for ratio in few} == {"1.7"} and "1.7 times the steps to 70% with 2 to 4" in text
+    assert f"{ratios[2, 7]:.2f} times with 7 epochs ({len(runs)} pairs" in text.replace("\n", " ")
+    ends = data[data["other"].str.contains("fade") & data["other"].str.endswith("20M")]
+    ends = ends.groupby(["other", "task", "seed"]).apply(at_the_end)
+    lost = ends.loc[f"{today} 20M"] - ends.loc[f"{today} half images 20M"]
+    assert f"up to {lost.max():.2f} lower ({len(lost)} pairs)" in text and lost.min() > -0.005
+    curves = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('half/')")
+    ends = curves.groupby(["task", "seed"]).apply(at_the_end)
+    before = pd.read_csv(DOCS / "results" / "evaluations.csv.xz").query("environment == 'low'")
+    before = before.groupby(["task", "seed"]).apply(at_the_end)
+    changes = (ends - before).dropna()
+    assert len(ends) == 12 and len(changes) == 9 and -0.015 < changes.mean() < -0.005
 
 
 def after(seconds):

@@ -227,7 +227,7 @@ def test_tuned_gains(table_one):
 
 def test_learners():
     """Million steps to 50 and 70% and tracking at the end, lowest and highest of the seeds that came so far."""
-    data = pd.read_csv(DOCS / "results" / "learners.csv.gz").query("total != 12000000")  # those are of docs/tried.md
+    data = pd.read_csv(DOCS / "results" / "learners.csv.xz").query("total != 12000000")  # those are of docs/tried.md
     _, rows = rows_of("howto/learner.md", "task | 50%: PPO")
     assert len(rows) == 6
     for task, *cells in rows:
