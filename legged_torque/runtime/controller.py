@@ -100,6 +100,8 @@ class Controller:
                 return problem
             self._enter(mode)
             self.reason = ""
+            if mode in (Mode.PASSIVE, Mode.DAMPING):
+                self.sent = self._at_rest()  # the command of this tick may not have been sent yet
         return ""
 
     def stop(self, reason: str) -> None:
@@ -150,7 +152,7 @@ class Controller:
             self.stop(problem)
         if self.mode in (Mode.STAND, Mode.POLICY) and self.state is not None:
             return self._moving(self.state)
-        return self._gentle(0.0 if self.mode == Mode.PASSIVE else self.brakes.damping)
+        return self._at_rest()
 
     def _moving(self, state: RobotState) -> MotorCommand:
         """Return the command of a robot that stands or walks, within its limits; damping if it cannot be meant."""
@@ -176,6 +178,10 @@ class Controller:
         """Return why it is too late for a command at a time [s], after so many missed deadlines in a row."""
         late, allowed = now - self._on_time, self.brakes.max_slow if missed > 1 else self.brakes.max_missed
         return f"all deadlines of {1e3 * late:.0f} ms were missed" if late > allowed + 1e-6 else ""
+
+    def _at_rest(self) -> MotorCommand:
+        """Return the command of a robot that neither stands nor walks."""
+        return self._gentle(0.0 if self.mode == Mode.PASSIVE else self.brakes.damping)
 
     def _gentle(self, damping: float) -> MotorCommand:
         """Return a command without targets, whose damping is within the limits at the last known speeds."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.control import JOINTS
 from support.exports import export_random
-from support.simulated import RATE, World
+from support.simulated import RATE, World, standing_at_once
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
@@ -197,6 +197,18 @@ def test_commands_that_are_late_are_not_sent(policy):
             world.took = took
             assert world.run(1, missed) == mode
             assert world.robot._command.kp.any() == (mode == Mode.STAND)  # what has come
+
+
+def test_the_operator_asks_before_a_command_is_sent(policy):
+    """The command that has been decided is not sent any more."""
+    for mode, damps in ((Mode.DAMPING, True), (Mode.PASSIVE, False)):
+        world = standing_at_once(policy)
+        assert world.controller.request(Mode.STAND) == ""
+        world.run(10)
+        assert world.robot._command.kp.all()
+        world._clock = lambda world=world, mode=mode: world.controller.request(mode) or world.now  # then it is sent
+        assert world.run(1) == mode
+        assert not world.robot._command.kp.any() and world.robot._command.kd.any() == damps
 
 
 def test_a_halt_between_two_ticks_is_noticed():
