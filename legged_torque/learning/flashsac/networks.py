@@ -18,7 +18,6 @@ from legged_torque.utils.errors import UserError
 
 LOG_STD = (-10.0, 2.0)
 """Bounds of the logarithm of the standard deviation of actions, before tanh."""
-MOMENTUM = 0.01  # weight of a batch in running means
 EXPANSION = 4  # size of a block's inner layer, in those of its outer one
 
 
@@ -34,7 +33,15 @@ class UnitLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return float32 outputs, whatever autocast multiplies. Shape: (..., samples, num_outputs)."""
-        return (x @ self.weight.transpose(-1, -2)).float()
+        product = self.aligned_product(x) if x.is_cuda else x @ self.weight.transpose(-1, -2)
+        return product.float()
+
+    def aligned_product(self, x: Tensor) -> Tensor:
+        """Return the outputs by a product of multiples of 8 numbers, since a GPU takes far longer for other sizes."""
+        num_outputs, num_inputs = self.weight.shape[-2], self.weight.shape[-1]
+        behind, below = -num_inputs % 8, -num_outputs % 8
+        weight = nn.functional.pad(self.weight, [0, behind, 0, below])
+        return (nn.functional.pad(x, [0, behind]) @ weight.transpose(-1, -2))[..., :num_outputs]
 
     @torch.jit.unused
     def bound(self) -> None:
@@ -57,19 +64,11 @@ class UnitBatchNorm(nn.Module):
 
     def forward(self, x: Tensor, learning: bool) -> Tensor:
         """Normalize by the running statistics, or if it is ``learning`` by those of the batch, which they follow."""
-        centred, var = x - self.mean.unsqueeze(-2), self.var
-        if learning:
-            mean = x.mean(dim=-2)
-            centred = x - mean.unsqueeze(-2)
-            var = centred.square().mean(dim=-2)
-            self._follow(mean.detach(), var.detach() * (x.shape[-2] / (x.shape[-2] - 1)))
-        return centred * (self.scale * torch.rsqrt(var + 1e-5)).unsqueeze(-2) + self.shift.unsqueeze(-2)
-
-    @torch.jit.unused
-    def _follow(self, mean: Tensor, var: Tensor) -> None:
-        """Move the running statistics towards those of a batch."""
-        self.mean.lerp_(mean, MOMENTUM)
-        self.var.lerp_(var, MOMENTUM)
+        has_copies = x.dim() == 3
+        behind = x.transpose(0, 1) if has_copies else x  # features of all copies behind each other
+        mean, var, scale, shift = self.mean.flatten(), self.var.flatten(), self.scale.flatten(), self.shift.flatten()
+        normalized = nn.functional.batch_norm(behind.flatten(1), mean, var, scale, shift, learning, momentum=0.01)
+        return normalized.view(behind.shape).transpose(0, 1) if has_copies else normalized
 
     @torch.jit.unused
     def bound(self) -> None:
