@@ -105,6 +105,7 @@ def main() -> None:
 
 def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dict[str, Any]:
     """Copy an export, and the settings and the actor of the run that it is in; return the card, or how it begins."""
+    network = network.absolute()  # the run is above its folder
     export, run, training = network.parent, network.parents[1], description["training"]
     shutil.copy(network, folder / NETWORK_FILE)
     if (export / DESCRIPTION_FILE).is_file():  # the network holds it, too

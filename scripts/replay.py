@@ -11,10 +11,8 @@ from typing import Annotated, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
-from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import write_errors
 from legged_torque.utils.limits import Limits, Positive
-from legged_torque.utils.options import choose_motors
+from legged_torque.utils.options import simulated_latency
 
 
 def parse_args() -> argparse.Namespace:
@@ -24,7 +22,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--policy", type=Path, required=True, help="policy.yaml, policy.onnx, or the folder of both")
     hint = "of the simulated robot: ideal, real, ..., or a file of identify.py; default: ideal"
     parser.add_argument("--motors", default="ideal", help=hint)
-    parser.add_argument("--latency", type=float, default=0.0, help="of its commands [ms]; default: 0")
+    parser.add_argument("--latency", type=float, help="of its commands [ms]; default: that of a file of motors, or 0")
     parser.add_argument("--limit", type=float, default=0.1, help="gap at which they part [rad]; default: %(default)s")
     parser.add_argument("--plot", type=Path, help="figure of all joints; needs the extra 'plots'")
     args = parser.parse_args()
@@ -45,9 +43,9 @@ def main() -> None:
     steps, equal = same_actions(log, policy)
     print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
     cfg = task_registry.get_cfgs(policy.description["task"])[0]
-    choose_motors(cfg, args.motors)
+    latency = simulated_latency(cfg, args.motors, args.latency)
     xml, rate = resource_path(policy.description["robot"]["file"]), 1.0 / log.period
-    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=args.latency / 1e3))
+    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=latency))
     parts = gap.parts_at(args.limit)
     until = min(parts.min(), gap.times[-1])
     print(f"joint: parts by {args.limit:g} rad at [s]; rms gap in the first {until:.2f} s [rad]")
@@ -59,12 +57,10 @@ def main() -> None:
 
 def plot(gap: Any, names: list[str], file: Path) -> None:
     """Draw positions of all joints, logged and simulated."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UserError("--plot needs the extra: pip install 'legged_torque[plots]'") from None
-    figure = Figure(figsize=(12, 8), layout="constrained")
-    axes = figure.subplots(-(-len(names) // 3), 3, sharex=True, squeeze=False)
+    from legged_torque.paper.plotting import load_pyplot, save_figure
+
+    size = {"figsize": (12, 8), "layout": "constrained"}
+    figure, axes = load_pyplot().subplots(-(-len(names) // 3), 3, sharex=True, squeeze=False, **size)
     for axis, name, logged, simulated in zip(axes.flat, names, gap.logged.T, gap.simulated.T, strict=False):
         axis.plot(gap.times, logged, label="log")
         axis.plot(gap.times, simulated, label="simulated", linestyle="--")
@@ -72,8 +68,7 @@ def plot(gap: Any, names: list[str], file: Path) -> None:
     axes.flat[0].legend()
     figure.supxlabel("time [s]")
     figure.supylabel("joint position [rad]")
-    with write_errors(file):
-        figure.savefig(file)
+    save_figure(figure, file)
     print(f"wrote {file}")
 
 

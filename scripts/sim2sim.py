@@ -80,9 +80,9 @@ def main() -> None:
     policy = Policy(args.policy)
     if args.motors:
         cfg = task_registry.get_cfgs(policy.description["task"])[0]
-        choose_motors(cfg, args.motors)
+        sets_delay = choose_motors(cfg, args.motors)
         policy.description["motors"] = cfg.motors.describe()
-        if any(cfg.motors.delay.range):
+        if sets_delay:
             policy.description.setdefault("latency", {})["actions"] = cfg.motors.delay.described()
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)

@@ -19,7 +19,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, NotNegative, Positive
-from legged_torque.utils.options import choose_motors
+from legged_torque.utils.options import simulated_latency
 
 RATE = 500.0  # messages per second, as a Go2
 TASKS = {"go2": "go2_position"}  # whose settings have the robot's file and motors
@@ -35,7 +35,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--domain", type=int, default=1, help="of DDS; default: %(default)s, as unitree_mujoco")
     parser.add_argument("--seconds", type=float, help="end after this time; default: with Ctrl-C")
     parser.add_argument("--motors", default="ideal", help="ideal, real, ..., or a file of identify.py; default: ideal")
-    parser.add_argument("--latency", type=float, default=0.0, help="of commands [ms]; default: 0")
+    parser.add_argument("--latency", type=float, help="of commands [ms]; default: that of a file of motors, or 0")
     hint = "lost, damaged (shares of messages), delay [s], silent=1; dead, hot or error=JOINT; may be repeated"
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
     parser.add_argument("--fault_at", type=float, default=0.0, help="second at which faults begin; default: at once")
@@ -58,9 +58,8 @@ def main() -> None:
     if args.viewer:
         check_display("sim_robot.py without --viewer")
     cfg, _ = task_registry.get_cfgs(TASKS[args.robot])
-    choose_motors(cfg, args.motors)
+    motors = {"latency": simulated_latency(cfg, args.motors, args.latency), "motors": cfg.motors}
     side = Go2Side(args.interface, args.domain)
-    motors = {"motors": cfg.motors, "latency": args.latency / 1e3}
     robot = SimRobot(resource_path(cfg.asset.file), side.joint_order, RATE, **motors)
     faults, start = with_faults(Faults(), args.fault, side.joint_order), time.monotonic()
 

@@ -29,7 +29,14 @@ from legged_torque.utils.devices import busy_cores_note, device_name, resolve_de
 from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
-from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint_of, load_config, new_run_dir, package_versions
+from legged_torque.utils.runs import (
+    CONFIG_FILE,
+    find_checkpoint_of,
+    given_iterations,
+    load_config,
+    new_run_dir,
+    package_versions,
+)
 from legged_torque.utils.stopwatch import stopwatch
 from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
 from legged_torque.viewer.training_viewer import TrainingViewer
@@ -73,7 +80,7 @@ def main() -> None:
             run = task_registry.load_run(options)
         env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
-        options.max_iterations = options.max_iterations or run.config.get("max_iterations")
+        options.max_iterations = options.max_iterations or given_iterations(run.config)
         kept = run.config.get("processes")  # from a file
         processes = min(max(kept, 1), distributed.MAX_PROCESSES) if isinstance(kept, int) else 1
         if is_first:
@@ -153,7 +160,9 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     if is_first and isinstance(env, LeggedRobot):
         print_notes([export_note(env, runner.alg.policy())])
     runner.verbose = options.verbose
-    total = options.max_iterations or num_iterations(env, train_cfg)
+    steps = runner.logger.tot_timesteps
+    before = runner.current_learning_iteration if steps else 0  # a runner of a user's own may not count steps on
+    total = options.max_iterations or before + num_iterations(env, train_cfg, steps)
     settings = {"env": to_dict(env_cfg), "train": to_dict(train_cfg), "version": package_versions()}
     distributed.check_same(flat({**settings, "task": options.task, "max_iterations": total}))
     remaining = total - runner.current_learning_iteration

@@ -1,7 +1,6 @@
 """Export of a checkpoint for a robot: ``policy.onnx``, ``policy.pt`` and ``policy.yaml``."""
 
 import dataclasses
-import hashlib
 import os
 import tempfile
 import warnings
@@ -43,6 +42,7 @@ from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.files import write_errors
+from legged_torque.utils.policies import sha256
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
@@ -156,7 +156,7 @@ def write_description(folder: Path, description: dict[str, Any]) -> None:
     network = onnx.load(folder / NETWORK_FILE)
     onnx.helper.set_model_props(network, metadata(description))
     onnx.save(network, folder / NETWORK_FILE)
-    description["network"]["sha256"] = hashlib.sha256((folder / NETWORK_FILE).read_bytes()).hexdigest()
+    description["network"]["sha256"] = sha256(folder / NETWORK_FILE)
     check(description)
     (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
 
@@ -205,7 +205,8 @@ def write_networks(model: MLPModel, folder: Path, description: dict[str, Any]) -
 
 def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, Any]) -> dict[str, Any]:
     """Return the contents of ``policy.yaml`` but for the network's checksum; arguments as of :func:`export_policy`."""
-    cfg, asset, ranges, mj_model = task.cfg, task.cfg.asset, task.cfg.commands.ranges, task.sim.mj_model
+    cfg, asset, mj_model = task.cfg, task.cfg.asset, task.sim.mj_model
+    commands: Any = cfg.commands
     clip, file = float(cfg.normalization.clip_actions), Path(asset.file)
     if file.is_absolute() and file.is_relative_to(RESOURCES_DIR):
         file = file.relative_to(RESOURCES_DIR.parent)
@@ -243,9 +244,8 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
             "decimation": cfg.control.decimation,
             "refresh_torques": cfg.control.refresh_torques,
         },
-        "commands": {name: list(getattr(ranges, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")}
-        | {"resampling_probability": cfg.commands.resampling_probability}
-        | ({"heading": list(ranges.heading), "heading_gain": HEADING_GAIN} if cfg.commands.heading_command else {}),
+        "commands": {**commands.allowed(), "resampling_probability": commands.resampling_probability}
+        | ({"heading": list(commands.ranges.heading), "heading_gain": HEADING_GAIN} if commands.has_headings() else {}),
         "initial_state": {"trunk_position": list(cfg.init_state.pos)}
         | {name: list(getattr(cfg.domain_rand, setting)) for name, setting in INITIAL_STATE.items()},
         "pushes": {"set_factor": cfg.domain_rand.push_set_factor},

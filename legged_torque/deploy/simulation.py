@@ -59,7 +59,9 @@ class Simulation:
         self._push_velocity, self._push_probability = push_velocity, push_probability
         description = policy.description
         self._timing, self._start = description["timing"], description["initial_state"]
-        self._commands, pushes = description["commands"], description.get("pushes", {})
+        self._commands, pushes = dict(description["commands"]), description.get("pushes", {})
+        if command:
+            self._commands.pop("heading", None)  # the yaw rate is given
         self._max_steps = math.ceil(description["episode"]["length"] * self._timing["control_frequency"] - 1e-6)
         ranges = [self._commands[name] for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")]
         self._command_range = np.array([command, command] if command else np.transpose(ranges), float)

@@ -101,10 +101,6 @@ class A1VariableStiffnessCfg(stiffness.VariableStiffnessCfg, A1Cfg):
     """A1 with positions and stiffness."""
 
 
-class A1VariableStiffnessCfgPPO(stiffness.VariableStiffnessCfgPPO, A1CfgPPO):
-    """Its training."""
-
-
 class A1SataCfg(sata.SataCfg, A1TorqueCfg):
     """A1 with torques by muscles that grow."""
 
@@ -134,7 +130,7 @@ A1_TASKS: tuple[tuple[str, str, type[LeggedRobotCfg], type[LeggedRobotCfgPPO]], 
     ("a1_torque_gravity_curriculum", _CURRICULUM, A1TorqueCurriculumCfg, A1TorqueGravityCfgPPO),
     ("a1_torque_gravity_multihead", _MULTI_HEAD, A1TorqueMultiHeadCfg, A1GravityMultiHeadCfgPPO),
     ("a1_torque_curriculum_high", _CURRICULUM, A1TorqueCurriculumHighCfg, A1TorqueCurriculumCfgPPO),
-    ("a1_variable_stiffness", _STIFFNESS, A1VariableStiffnessCfg, A1VariableStiffnessCfgPPO),
+    ("a1_variable_stiffness", _STIFFNESS, A1VariableStiffnessCfg, A1CfgPPO),
     ("a1_decap", _DECAP, A1DecapCfg, A1TorqueCfgPPO),
     ("a1_sata", _SATA, A1SataCfg, A1SataCfgPPO),
 )

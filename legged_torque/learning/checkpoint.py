@@ -54,7 +54,7 @@ def on_host(content: Any) -> Any:
 
 
 def write(file: Path, content: dict[str, Any]) -> str:
-    """Write tensors and plain values, and return the :func:`digest` of the file.
+    """Write tensors and plain values, and return the SHA-256 of the file.
 
     The file is either complete or absent at any time; a UserError if it cannot be written.
     """
@@ -108,11 +108,6 @@ def check_counters(state: dict[str, Any], file: str) -> None:
             check_value(name, counters[name], hint)
     except UserError as error:
         raise UserError(f"'{file}' is not a usable checkpoint: {error}") from None
-
-
-def digest(file: Path) -> str:
-    """Return the SHA-256 of a file in hexadecimal; empty if there is no such file."""
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
 def not_finite(content: Any, name: str = "") -> str:

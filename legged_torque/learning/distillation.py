@@ -74,8 +74,9 @@ class Distillation(algorithms.Distillation):
             raise UserError(
                 "a student needs teachers: --set 'distillation.teachers=[RUN]' names the run of a trained one"
             )
-        members = [Teacher(file, self._env, self._task_name) for file in self._files]
-        self.teacher = Teachers(members, self._env)
+        # the first one last: the counters of the task, and so its curricula, become those of the last that is loaded
+        members = [Teacher(file, self._env, self._task_name) for file in reversed(self._files)]
+        self.teacher = Teachers(members[::-1], self._env)
 
     def act(self, obs: TensorDict) -> Tensor:
         """Return the student's actions with noise, and keep its teachers'. Shape: (num_envs, num_actions)."""

@@ -13,6 +13,7 @@ from legged_torque.learning.protocols import Stateful
 from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.policies import sha256
 
 
 class Worlds:
@@ -55,7 +56,7 @@ class Worlds:
             raise UserError(f"{type(self._task).__name__} does not keep them")
         if not file.is_file():
             raise UserError(f"there is no '{file}': only the last checkpoint of a run keeps them")
-        if digest != checkpoint.digest(file):
+        if digest != sha256(file):
             raise UserError(f"'{file}' is damaged or belongs to another checkpoint")
         content = checkpoint.load(file, "file of worlds", "cpu")
         if "identity" not in content:

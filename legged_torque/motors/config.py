@@ -48,6 +48,13 @@ class LatencyCfg(Section):
                 raise UserError(f"{path}.{name} must be {whole} (sim.dt), not {value} milliseconds")
         return (counts[0], counts[1]), counts[2], decimation if self.unit == "control_steps" else 1
 
+    def seconds(self, path: str, dt: float, decimation: int) -> float:
+        """Return the time [s] by which packets are late; arguments as of :meth:`counted`, a UserError if it varies."""
+        (low, high), jitter, per_unit = self.counted(path, dt, decimation)
+        if low != high or jitter or self.loss:
+            raise UserError(f"{path} is not the same for all packets: --latency gives one time")
+        return low * per_unit * dt
+
     def described(self) -> dict[str, Any]:
         """Return these settings for ``policy.yaml``."""
         return {"range": list(self.range), "unit": self.unit, "jitter": self.jitter, "loss": self.loss}

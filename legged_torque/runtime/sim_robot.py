@@ -1,5 +1,6 @@
 """The other side: a robot in plain MuJoCo with drives, a watchdog and faults, that speaks a robot's messages."""
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from legged_torque.utils.mjcf import hang_up, loading, set_joints
 
 WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
-STEP = 1e-3  # of the physics, at which the drives close their loops [s]
+STEP = 1e-3  # longest of the physics, at which the drives close their loops [s]
 FOLDED = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}  # angles of a robot that lies on its belly [rad]
 
 
@@ -67,10 +68,11 @@ class SimRobot:
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
+        self._steps = max(math.ceil(1.0 / (rate * STEP) - 1e-9), 1)
         with loading(xml):
             spec = mujoco.MjSpec.from_file(str(xml))
             place_ground(spec, {}, [])
-            spec.option.timestep = STEP
+            spec.option.timestep = 1.0 / (rate * self._steps)
             self.model = spec.compile()
         self.data, self.joint_order = mujoco.MjData(self.model), joint_order
         joints = [self.model.joint(name) for name in joint_order]
@@ -79,7 +81,6 @@ class SimRobot:
         owners = self.model.actuator_trnid[:, 0].tolist()
         self._motors = np.array([owners.index(joint.id) for joint in joints])
         self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
-        self._steps = round(1.0 / (rate * STEP))
         self._drives = MotorTwin(self._description(motors))
         set_joints(self.model, motors.of_joints(joint_order) if motors else {})
         if hangs:
@@ -106,7 +107,7 @@ class SimRobot:
 
     def step(self, received: Received) -> None:
         """Move on for the time between two messages, under the newest command."""
-        self._age += self._steps * STEP
+        self._age += self._steps * self.model.opt.timestep
         if isinstance(received.newest, MotorCommand):
             self._on_their_way.append((self.data.time + self._latency, received.newest))
             self._age = 0.0
@@ -133,7 +134,7 @@ class SimRobot:
         """Return what the motors read of a ``policy.yaml``, at the rate of the physics."""
         names, zeros = self.joint_order, dict.fromkeys(self.joint_order, 0.0)
         limits = {name: [float(low), float(high)] for name, low, high in zip(names, *self.limits, strict=True)}
-        timing = {"decimation": self._steps, "physics_frequency": 1.0 / STEP}
+        timing = {"decimation": self._steps, "physics_frequency": 1.0 / self.model.opt.timestep}
         gains = {"stiffness": zeros, "damping": zeros}
         described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
         return {**described, "gains": gains, "motors": motors.describe() if motors else {}}

@@ -42,8 +42,7 @@ class Engine(Protocol):
     """Steps and resets ``num_envs`` worlds of one robot.
 
     An engine is a subclass with these members and an entry in :data:`~legged_torque.sim.registry.ENGINES`. It inherits
-    :meth:`load_state_dict`, a :meth:`check_buffers` that never warns, and methods of the capabilities that it lacks,
-    which raise a UserError.
+    a :meth:`check_buffers` that never warns, and methods of the capabilities that it lacks, which raise a UserError.
 
     Tensors are the engine's own memory: writing them changes the state, and their addresses never change. Nothing here
     waits for the host except :meth:`check_buffers`.
@@ -115,19 +114,6 @@ class Engine(Protocol):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return everything on which the next steps of the worlds depend, as references to the engine's memory."""
-
-    def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Copy tensors from another :meth:`state_dict` into this engine's.
-
-        A UserError, and nothing is copied, if names, types or shapes differ.
-        """
-        own = self.state_dict()
-        kinds = [{name: (tensor.dtype, tensor.shape) for name, tensor in each.items()} for each in (state, own)]
-        if kinds[0] != kinds[1]:
-            names = sorted(name for name in {*state, *own} if kinds[0].get(name) != kinds[1].get(name))
-            raise UserError(f"the state of the worlds does not fit the engine: {', '.join(names)}")
-        for name, tensor in own.items():
-            tensor.copy_(state[name])
 
     # ---- "applied_forces" --------------------------------------------------------------------------------------------
 

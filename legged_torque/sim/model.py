@@ -12,10 +12,10 @@ _DATASPEC = sum(1 << int(f) for f in (mujoco.mjtConDataField.mjCONDATA_FOUND, mu
 _REDUCE_NETFORCE = 3
 
 
-def collision_geoms(spec: mujoco.MjSpec, floor: str = FLOOR) -> list[str]:
+def collision_geoms(spec: mujoco.MjSpec) -> list[str]:
     """Return the names of the geoms that can touch the ground, in the file's order."""
     geoms = [geom.name for geom in spec.geoms if geom.name and (geom.contype or geom.conaffinity)]
-    return [name for name in geoms if name != floor]
+    return [name for name in geoms if name != FLOOR]
 
 
 def indices_matching(names: list[str], parts: list[str], kind: str = "collision geom") -> list[int]:

@@ -117,14 +117,15 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     train_cfg.refuse_unread(path for path, _ in changes)
 
 
-def choose_motors(env_cfg: Any, name: str) -> None:
+def choose_motors(env_cfg: Any, name: str) -> bool:
     """Choose a chain of motors by its name, or take settings of motors and of what is drawn at random from a YAML file.
 
-    A UserError if there is no such chain or file, or the file holds anything else.
+    Returns whether a file has set when commands come, ``motors.delay``. A UserError if there is no such chain or file,
+    or the file holds anything else.
     """
     if not name.endswith(MOTOR_FILES):
         env_cfg.motors.choose(name)
-        return
+        return False
     try:
         values = parse_yaml(Path(name).read_text("utf-8"), f"'{name}'")
     except (OSError, UnicodeDecodeError) as error:
@@ -135,6 +136,18 @@ def choose_motors(env_cfg: Any, name: str) -> None:
         if section not in OF_MOTORS:
             raise unknown_name(f"section of '{name}'", str(section), OF_MOTORS)
     update_from_dict(env_cfg, values)
+    return "delay" in values.get("motors", {})
+
+
+def simulated_latency(env_cfg: Any, motors: str, latency: float | None) -> float:
+    """Choose motors as :func:`choose_motors`, and return by how much commands are late [s]: ``latency`` [ms], if given.
+
+    If not, what a file of motors says; a UserError if that is not one time.
+    """
+    of_file = choose_motors(env_cfg, motors)
+    if latency is None and of_file:
+        return env_cfg.motors.delay.seconds(f"motors.delay of '{motors}'", env_cfg.sim.dt, env_cfg.control.decimation)
+    return (latency or 0.0) / 1e3
 
 
 def apply_perturbation(env_cfg: Any, name: str) -> None:

@@ -184,6 +184,16 @@ def steps_per_iteration(config: dict[str, Any]) -> int | None:
     return math.prod(factors) if all(type(factor) is int for factor in factors) else None
 
 
+def given_iterations(config: dict[str, Any]) -> int | None:
+    """Return how many iterations a run was told to make; None if they are what its settings say, or unknown."""
+    iterations, steps = config.get("max_iterations"), steps_per_iteration(config)
+    try:
+        is_of_settings = 0 <= iterations * steps - config["train"]["runner"]["total_steps"] < steps  # type: ignore[operator]
+    except (KeyError, TypeError):
+        return iterations
+    return None if is_of_settings else iterations
+
+
 def package_versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that decide how a training goes.
 

@@ -292,10 +292,10 @@ def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
     return Path(log_root or LOGS) / train_cfg.runner.experiment_name
 
 
-def num_iterations(env: VecEnv, train_cfg: Any) -> int:
-    """Return how many iterations a whole training takes, with the steps of all processes counted."""
+def num_iterations(env: VecEnv, train_cfg: Any, done: int = 0) -> int:
+    """Return how many iterations a training takes from ``done`` steps on, with the steps of all processes counted."""
     steps_per_iteration = distributed.world_size() * env.num_envs * train_cfg.runner.num_steps_per_env
-    return math.ceil(train_cfg.runner.total_steps / steps_per_iteration)
+    return math.ceil(max(train_cfg.runner.total_steps - done, 0) / steps_per_iteration)
 
 
 def set_seed(seed: int) -> None:

@@ -336,6 +336,15 @@ def test_nominal_settings():
     assert not (cfg.domain_rand.randomize_parameters or cfg.domain_rand.push_robots or cfg.noise.add_noise)
 
 
+def test_one_command(make_task, tmp_path):
+    """A policy that was trained for one command says so: a robot can be steered no further, and to no heading."""
+    settings = {"commands.fixed": [0.5, 0.0, -0.1], "commands.heading_command": True}
+    export_random(make_task, "a1_torque", tmp_path / "out", **settings)
+    commands = Policy(tmp_path / "out").description["commands"]
+    expected = {"lin_vel_x": [0.5, 0.5], "lin_vel_y": [0.0, 0.0], "ang_vel_yaw": [-0.1, -0.1]}
+    assert commands.pop("resampling_probability") == 0.002 and commands == expected
+
+
 @pytest.mark.parametrize("package", ["onnx", "jsonschema"])
 def test_missing_extras(make_task, exported, tmp_path, monkeypatch, package):
     """A package that is not installed is named with its extra, on export and when the policy is run."""

@@ -1,8 +1,12 @@
 """Latency in plain MuJoCo: what an export says of it, and that sim2sim has it."""
 
+import json
+from itertools import product
+
 import numpy as np
 import pytest
 from support.exports import XML, export_random
+from support.scripts import run_here
 from support.settings import error_of
 
 from legged_torque.deploy.description import read
@@ -39,6 +43,20 @@ def test_constant_delays(make_task, tmp_path):
     for t, applied in enumerate(torques):
         expected = scale * sent[(t - 6) // 4] if t >= 6 else np.zeros(12)
         np.testing.assert_allclose(applied, expected, rtol=1e-6)
+
+
+def test_delay_of_a_file_of_motors(make_task, tmp_path):
+    """sim2sim.py takes it in place of the export's, also if it is 0."""
+    for name, delay in (("late", [4, 4]), ("ideal", [0, 0])):
+        export_random(make_task, "a1_torque", tmp_path / name, **{"motors.delay.range": delay})
+        (tmp_path / f"{name}.yaml").write_text(f"motors: {{delay: {{range: {delay}}}}}")
+    found = {}
+    for name, motors in product(("late", "ideal"), (None, "late.yaml", "ideal.yaml")):
+        words = [name, "--robots=1", "--steps=20", "--json=out.json", *([f"--motors={motors}"] if motors else [])]
+        assert run_here("sim2sim.py", *words, root=tmp_path)[0] == 0
+        found[name, motors] = json.loads((tmp_path / "out.json").read_text())["metrics"]
+    assert found["late", "ideal.yaml"] == found["ideal", "ideal.yaml"] != found["late", None]
+    assert found["late", "late.yaml"] == found["ideal", "late.yaml"] == found["late", None]
 
 
 def test_jitter_and_loss():

@@ -8,22 +8,22 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.exports import XML, changed_xml, export_random
+from support.exports import XML, export_random
 from support.ground import ground_cfg
+from support.robot_files import changed as changed  # a fixture
 from support.scripts import assert_told_in_one_line, run_here
-from support.settings import flatten
 
 from legged_torque.deploy import ground
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Simulation, quaternion
+from legged_torque.deploy.simulation import Simulation, evaluate, quaternion
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 
-ROUGH = flatten({"terrain": to_dict(ground_cfg().terrain)}) | {"terrain.measure_heights": True}
+ROUGH = flat({"terrain": to_dict(ground_cfg().terrain)}) | {"terrain.measure_heights": True}
 ROUGH |= {"terrain.measure_delay": 2, "commands.heading_command": True, "domain_rand.init_place": [-0.2, 0.3]}
 CALM = {"asset.terminate_after_contacts_on": [], "sim.solver_iterations": 100, "sim.ls_iterations": 50}
 STILL = (np.zeros(3), np.zeros(3), np.zeros(12))
@@ -207,14 +207,22 @@ def test_chosen_kinds(policy):
         del description["terrain"]
 
 
-def test_ground_of_the_mjcf(policy, tmp_path):
+def test_a_given_yaw_rate_counts(policy, robot):
+    """With a command, there is no heading to turn to, and turning on the spot is tracked."""
+    metrics = evaluate(Simulation(policy, robot, command=(0.0, 0.0, 0.5)), 1, 20, 1)
+    assert math.isfinite(metrics["track_percentage"].mean)
+    drawn = evaluate(Simulation(policy, robot), 1, 20, 1)
+    assert math.isfinite(drawn["track_percentage"].mean)
+
+
+def test_ground_of_the_mjcf(policy, changed):
     """A plane without a name gives way to the tiles; boxes stay, and are seen by the scan, on a plane without end."""
 
     def edit(root):
         (floor,) = root.findall("worldbody/geom")
         del floor.attrib["name"]
 
-    assert len(MujocoRobot(changed_xml(tmp_path, edit), policy.description).origins) == 6
+    assert len(MujocoRobot(changed(edit), policy.description).origins) == 6
 
     def add_step(root):
         edit(root)
@@ -222,7 +230,7 @@ def test_ground_of_the_mjcf(policy, tmp_path):
         box = {"type": "box", "size": "0.5 1 0.1", "pos": "1 0 0.02"}
         root.find("worldbody").append(root.makeelement("geom", box))
 
-    robot = MujocoRobot(changed_xml(tmp_path, add_step), policy.description)
+    robot = MujocoRobot(changed(add_step), policy.description)
     assert robot.notes[0].startswith("the MJCF has ground of its own, on which the robot starts at the origin")
     robot.reset([0.0, 0.0, 0.4], quaternion(0, 0, 0), policy.nominal_pose, STILL)
     places = np.array([[0.49, 0.0], [0.51, 0.9], [1.0, 1.1], [9.0, 9.0]])

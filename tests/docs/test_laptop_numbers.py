@@ -9,7 +9,6 @@ from support.documents import DOCS, rows_of, same, text_of
 from legged_torque.envs import task_registry
 from legged_torque.utils.options import Options
 
-NEW = "4980b63"  # with the settings of today
 KEPT = "lam=0.9 gamma=0.97 desired_kl=0.03"
 SETTINGS = ["worlds", "steps_per_rollout", "mini_batches", "epochs", "other"]
 
@@ -116,25 +115,23 @@ def after(seconds):
 def test_laptop():
     """Minutes of training on two cores until evaluations track 70 and 80%, and tracking at the end."""
     data = pd.read_csv(DOCS / "results" / "laptop.csv.gz")
-    new, of = data[data["commit"] == NEW], ["task", "seed"]
-    before = data[(data["commit"] != NEW) & (data["track_percentage"] >= 0.7)].groupby(of)["seconds"].min()
-    text = text_of("getting_started.md", "On two cores of a virtual machine")
-    first, second, third, fourth = after(before["a1_torque_multihead"])
-    assert f"70% took {first}, {second}, {third} and {fourth} (A1, seeds 1 to 4)" in text
-    assert "{}, {} and {} (Go2, seeds 1 to 3)".format(*after(before["go2_torque_multihead"])) in text
-    assert "since, {}, {}, {} and {} (d9348b7".format(*after(before["a1_position"])) in text
-    walks, soon = (new[new["track_percentage"] >= share].groupby(of)["seconds"].min() for share in (0.7, 0.8))
-    times = [
-        after(seconds[task]) for task in ("a1_torque_multihead", "go2_torque_multihead") for seconds in (walks, soon)
-    ]
-    last = new[(new["steps"] > 0.82 * 20e6) & (new["seed"] == 1)].groupby("task")["track_percentage"]
+    _, rows = rows_of("getting_started.md", "task")
+    for task, *cells in rows:
+        of_task = data[data["task"] == task.strip("`")]
+        for share, cell in zip((0.7, 0.8), cells, strict=True):
+            seconds = of_task[of_task["track_percentage"] >= share].groupby("seed")["seconds"].min()
+            assert list(seconds.index) == [1, 2, 3, 4] and cell == ", ".join(after(seconds)), (task, share)
+    last = data[(data["steps"] > 0.82 * 20e6) & (data["seed"] == 1)].groupby("task")["track_percentage"]
     assert (last.size() == 8).all()
     ends = [f"{end:.2f}" for end in last.mean()]
-    assert "after {} and {} minutes of training, 80% after {} and {};".format(*times[0], *times[1]) in text
-    assert f"seed 1 tracked {ends[0]} in the last 18%" in text and f"steps, {ends[1]} in the last 18%" in text
-    said = "70% after {}, {} and {}, 80% after {}, {} and {};".format(*times[2], *times[3])
-    assert said in text and len(times[2]) == len(times[3]) == 3
+    text = text_of("getting_started.md", "Seed 1 ended at")
+    assert text.startswith(f"{ends[0]} (A1, ") and f" and {ends[1]} (Go2" in text
     assert "tracks {} (A1) and {} (Go2) at the end".format(*ends) in text_of("tried.md", "**At the end of 20 million")
+    runs, _ = laptop_settings()
+    ends = runs[runs["other"] == f"{KEPT} fade 4-10M 20M"].groupby(["task", "seed"]).apply(at_the_end)[:, 1]
+    rough = ends.pop("a1_rough_torque_multihead")
+    assert f"tasks (seed 1) ended at {ends.min():.2f} (`{ends.idxmin()}`) to {ends.max():.2f}, on rough ground" in text
+    assert f"on rough ground at {rough:.2f} " in text and len(ends) == 11
 
 
 def test_fading():

@@ -22,6 +22,7 @@ def make_crossing(grounds, worlds, task="a1_position"):
     """A task for trials on grounds, on the CPU."""
     torch.manual_seed(0)
     cfg, _ = task_registry.get_cfgs(task)
+    cfg.commands.fixed = [0.5, 0.1, 0.3]  # of the training, not of trials
     return task_registry.make_env(task, Options(device="cpu"), grounds.cfg(cfg, worlds))[0]
 
 

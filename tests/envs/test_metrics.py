@@ -144,6 +144,10 @@ def test_tracking_of_headings_by_hand(make_task):
     numerator, counted = metrics.ratios()["track_percentage"]
     assert counted.tolist() == [1.0, 1.0] and numerator.tolist() == pytest.approx([0.8, (0.5 + 1.0) / 2])
     assert metrics.means()["track_angular"] == pytest.approx((0.299**2 + 0.3**2) / 2)
+    task.cfg.commands.fix([0.0, 0.0, 0.5])  # which turns to no heading
+    metrics.clear()
+    add(task, metrics, commands=[[0.0, 0.0, 0.5]] * 2, lin_vel=[[0.0] * 3] * 2, ang_vel=[[0.0, 0.0, 0.25]] * 2)
+    assert metrics.means()["track_percentage"] == pytest.approx(0.5)
 
 
 def test_standard_error_by_hand():

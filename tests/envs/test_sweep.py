@@ -104,6 +104,7 @@ def test_pushes(make_task):
         ("motor_strength", {"domain_rand.motor_strength": {}}, "motor_strength is always 1: give domain_rand."),
         ("action_delay", {}, "action_delay is always 0: give motors.delay.range"),
         ("foot_pos", {}, "foot_pos has 12"),
+        ("contact_damping", {}, "contact_damping has no draw of its own, but that of contact_stiffness: sweep"),
     ],
 )
 def test_what_cannot_be_split(make_task, name, settings, message):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import random, step_mujoco
-from support.on_device import make_env, make_robot, make_sim, sim_of, step
+from support.on_device import make_env, make_robot, make_sim, step
 
 from legged_torque.sim.registry import ENGINES
 
@@ -41,6 +41,6 @@ def test_mujoco_warp_stands_in_a_graph(device):
     env, _ = make_env(device, *words, "--set=domain_rand.init_dof_pos_scale=[1,1]")
     for _ in range(80):
         env.step(torch.zeros(64, env.num_actions, device=device))
-    force, weight = sim_of(env).contact_force, 9.81 * 12.453
+    force, weight = env.sim.contact_force, 9.81 * 12.453
     assert ((force[:, :, 2] > 5.0).sum(dim=1) == 4).all()
     np.testing.assert_allclose(force.sum(dim=1).cpu().numpy(), [[0.0, 0.0, weight]] * 64, rtol=0, atol=0.02 * weight)

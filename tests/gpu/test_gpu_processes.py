@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.on_device import make_runner, sim_of
+from support.on_device import make_runner
 from support.reproducible import differences, finish
 from support.rollouts import state_of
 
@@ -48,7 +48,7 @@ def train(folder, device, words):
         runner.claim_log_dir({})
     notes = {"start": state_of(runner.alg)}
     runner.learn(2, init_at_random_ep_len=True)
-    notes |= {"trained": state_of(runner.alg), "worlds": sim_of(runner.env).qpos.clone()}
+    notes |= {"trained": state_of(runner.alg), "worlds": runner.env.sim.qpos.clone()}
     if distributed.rank() == 0:
         shutil.copytree(runner.log_dir, folder / "kept")
     distributed.any_process(False, runner.env.device)  # waits for the copy

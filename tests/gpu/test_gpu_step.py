@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import kstest
-from support.on_device import make_env, no_waiting, sim_of, use_graphs, used_memory
+from support.on_device import make_env, no_waiting, use_graphs, used_memory
 
 WORLDS = 1024
 WORDS = ["--task=a1_torque_multihead", f"--num_envs={WORLDS}", "--perturbation=low"]
@@ -26,7 +26,7 @@ def outcome(env, step):
     """Take a step from a seed, and return copies of what came of it."""
     torch.manual_seed(100 + step)
     obs, rewards, dones, extras = env.step(actions_of(env, step))
-    exact = {"dones": dones, "time outs": extras["time_outs"], "qpos": sim_of(env).qpos, "qvel": sim_of(env).qvel}
+    exact = {"dones": dones, "time outs": extras["time_outs"], "qpos": env.sim.qpos, "qvel": env.sim.qvel}
     rounded = {**obs, "rewards": rewards, "episode sums": env.episode_sums, "air time": env.feet_air_time}
     return tuple({name: value.clone() for name, value in part.items()} for part in (exact, rounded))
 
@@ -92,8 +92,8 @@ def test_bad_numbers_end_their_world(device):
     for step in range(8):
         actions = actions_of(broken, step)
         if step == 4:
-            sim_of(broken).qpos[worlds[0], 8] = math.nan
-            sim_of(broken).qvel[worlds[1], 10] = math.inf
+            broken.sim.qpos[worlds[0], 8] = math.nan
+            broken.sim.qvel[worlds[1], 10] = math.inf
         results = []
         for env in (broken, healthy):
             torch.manual_seed(step)
@@ -101,7 +101,7 @@ def test_bad_numbers_end_their_world(device):
             if step == 4 and env is broken:
                 given[worlds[2], 0] = math.nan
             obs, rewards, dones, _ = env.step(given)
-            state = (sim_of(env).qpos, sim_of(env).qvel)
+            state = (env.sim.qpos, env.sim.qvel)
             results.append([tensor.clone() for tensor in (*obs.values(), rewards, dones, *state)])
         for mine, other in zip(*results, strict=True):
             assert torch.isfinite(mine).all() and torch.equal(mine[others], other[others]), step
@@ -137,7 +137,7 @@ def assert_uniform(values, low, high):
 
 def numbers(env):
     """The chosen number of each field in all worlds. Shape: (fields, num_envs)."""
-    fields = {name: sim_of(env).field(name).flatten(1) for name in DRAWN}
+    fields = {name: env.sim.field(name).flatten(1) for name in DRAWN}
     return torch.stack([field[:, DRAWN[name][0]] for name, field in fields.items()])
 
 

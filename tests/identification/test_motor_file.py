@@ -5,7 +5,7 @@ from support.settings import error_of
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import Options, simulated_latency
 
 REFUSED = {
     "rewards: {alive: 1.0}": "unknown section of",
@@ -25,6 +25,31 @@ def test_refused(tmp_path, text):
     assert "own.yaml" in error_of(task_registry.get_cfgs, "go2_torque", options)
     (tmp_path / "own.yaml").write_text(text)
     assert REFUSED[text] in error_of(task_registry.get_cfgs, "go2_torque", options)
+
+
+@pytest.mark.parametrize(
+    ("delay", "late"),
+    [
+        ("{unit: milliseconds, range: [15, 15]}", 0.015),
+        ("{range: [3, 3]}", 0.015),
+        ("{unit: control_steps, range: [1, 1]}", 0.02),
+        ("{range: [0, 0]}", 0.0),
+    ],
+)
+def test_delay_of_a_simulated_robot(tmp_path, delay, late):
+    """It is that of the file, in any unit, unless another one is given; without a file, there is none."""
+    (tmp_path / "own.yaml").write_text(f"motors: {{delay: {delay}}}")
+    for motors, given, expected in (("own.yaml", None, late), ("own.yaml", 7.0, 0.007), ("real", None, 0.0)):
+        cfg = task_registry.get_cfgs("go2_torque")[0]
+        name = str(tmp_path / motors) if "." in motors else motors
+        assert simulated_latency(cfg, name, given) == pytest.approx(expected)
+
+
+def test_delay_that_varies(tmp_path):
+    """A simulated robot has one: it must be chosen."""
+    (tmp_path / "own.yaml").write_text("motors: {delay: {range: [0, 4]}}")
+    cfg = task_registry.get_cfgs("go2_torque")[0]
+    assert "--latency gives one time" in error_of(simulated_latency, cfg, str(tmp_path / "own.yaml"), None)
 
 
 def test_other_robot():

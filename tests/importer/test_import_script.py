@@ -1,11 +1,10 @@
 """Importing a robot's file never runs code from it, and the script writes both of its files or none."""
 
-import runpy
-import sys
+import functools
 
 import pytest
 from support.published import as_mjcf, urdf
-from support.scripts import ROOT
+from support.scripts import ROOT, assert_told_in_one_line, run_here
 
 from legged_torque.envs import robots, task_registry, tasks
 from legged_torque.envs.base.asset import load_asset
@@ -53,36 +52,27 @@ def test_a_broken_module(tmp_path, monkeypatch, capsys):
     assert "Note: the robot 'broken' is missing: SyntaxError" in capsys.readouterr().err
 
 
-def test_script(tmp_path, monkeypatch, capsys):
+def test_script(tmp_path, monkeypatch):
     """The script writes both files once, says what simulates the robot, and writes over nothing."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "dog.urdf").write_text(urdf())
-    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--out", "new"])
-    runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
-    output = capsys.readouterr().out
-    before = task_registry._tasks
-    assert "sim.engine 'fused' simulates it" in output
+    run = functools.partial(run_here, "import_robot.py", "dog.urdf", root=tmp_path)
+    status, output, _ = run("--out", "new")
+    assert status == 0 and "sim.engine 'fused' simulates it" in output
     assert output.endswith(f"Train it: python {ROOT}/scripts/train.py --task_file new/dog.py --task=dog_position\n")
+    before = task_registry._tasks
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     task_registry.import_files(["new/dog.py"])
     assert {"dog_position", "dog_torque_multihead", "dog_rough_torque_scan"} <= set(task_registry.names())
     assert len(load_asset(task_registry.get_cfgs("dog_torque")[0]).feet) == 4
     monkeypatch.setattr(task_registry, "_tasks", before)
     assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
-    with pytest.raises(SystemExit, match="2"):
-        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
-    assert "exists" in capsys.readouterr().err
-    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "go2_torque"])
-    with pytest.raises(SystemExit, match="2"):
-        runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
-    assert "names that are taken, as 'go2_torque_gravity'" in capsys.readouterr().err
-    monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "cat"])
-    runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+    assert_told_in_one_line(run("--out", "new"), "exists")
+    assert_told_in_one_line(run("--name", "go2_torque"), "names that are taken, as 'go2_torque_gravity'")
+    assert run("--name", "cat")[0] == 0
     assert sorted(path.name for path in tmp_path.glob("cat.*")) == ["cat.py", "cat.xml"]  # outside of a clone
     for number in ("1e20", "0"):
-        monkeypatch.setattr(sys, "argv", ["import_robot.py", "dog.urdf", "--name", "hen", "--torque_limit", number])
-        with pytest.raises(SystemExit, match="2"):
-            runpy.run_path(str(ROOT / "scripts" / "import_robot.py"), run_name="__main__")
+        assert run("--name", "hen", "--torque_limit", number)[0] == 2
     assert not list(tmp_path.glob("hen.*"))
 
 

@@ -197,6 +197,20 @@ def test_a_student_from_command_to_simulation(teacher):
     assert run_here("sim2sim.py", "out", "--robots=1", "--steps=3", root=root)[0] == 0
 
 
+def test_curricula_are_those_of_the_first_teacher(teacher):
+    """The student's steps are counted on from those of its first teacher, whatever others there are."""
+    root, name = teacher
+    words = [*SMALL, *OF_TEACHER, "--max_iterations=3", "--run_name=longer"]
+    assert run_here("train.py", *words, root=root)[0] == 0
+    (longer,) = (root / "logs" / "a1_position").glob("*_longer")
+    for first, second, steps in ((name, longer.name, 16), (longer.name, name, 48)):
+        words = [*SMALL, *OF_STUDENT, "--max_iterations=1", f"--run_name=of{steps}"]
+        assert run_here("train.py", *words, f"--set=distillation.teachers=[{first},{second}]", root=root)[0] == 0
+        (run,) = (root / "logs" / "a1_position").glob(f"*_of{steps}")
+        state = checkpoint.read(run / "model_1.pt", "checkpoint", "cpu")
+        assert state["infos"]["task"]["total_steps"] == steps + 16
+
+
 def test_refusals(teacher):
     """No teacher, one that does not exist or is of another task or control, and settings that are not read."""
     root, name = teacher

@@ -7,10 +7,11 @@ import pytest
 import torch
 from support.evaluations import COLUMNS, note_steps, read_rows
 from support.runners import build_runner
-from support.settings import error_of, flatten, get, get_cfgs
+from support.settings import error_of, get, get_cfgs
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.learning.evaluator import TrainingEvaluator, append_row
+from legged_torque.utils.config import flat
 from legged_torque.utils.metrics import UNITS
 
 
@@ -35,7 +36,7 @@ def make_runner(make_task, tmp_path):
 
 def perturb(name):
     """The changes of a perturbation by dotted path."""
-    return flatten(get_cfgs()[0].perturbations()[name])
+    return flat(get_cfgs()[0].perturbations()[name])
 
 
 def rows_of(runner, name="evaluations.csv"):

@@ -12,7 +12,7 @@ from support.reports import (
     SETTINGS,
     Page,
     line,
-    run_script,
+    run_report,
     whole_run,
     write_experiment,
     write_grounds,
@@ -20,6 +20,7 @@ from support.reports import (
     write_result,
     write_rows,
 )
+from support.scripts import assert_told_in_one_line
 
 from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES
@@ -62,7 +63,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def report(folder):
     """The folder of the report on the experiment."""
-    assert run_script(folder, "--videos", folder / "videos") == 0
+    assert run_report(folder, "--videos", folder / "videos", root=folder.parent)[0] == 0
     return folder / "report"
 
 
@@ -123,7 +124,7 @@ def test_comparisons_that_mean_nothing(tmp_path, tracking, million):
     for task in ("a1_position", "a1_torque", "a1_multihead"):  # with little cost, and less force than the weight
         rows = [line(i, tracking, collision_force=99.0, cost_of_transport=0.01) for i in (million // 2, million)]
         write_part(tmp_path / "e" / f"{task}-low-s1" / "2026-01-01_00-00-00", rows, max_iterations=million)
-    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    assert run_report(tmp_path / "e", "--out", tmp_path / "out", root=tmp_path)[0] == 0
     text = (tmp_path / "out" / "report.md").read_text()
     assert "Nothing is compared with the paper" in text
     assert not re.findall("[✓≈✗]", text) and "0.7642" not in text
@@ -139,7 +140,7 @@ def test_differences(tmp_path):
         if (cell, seed) != ("a1_multihead-low", 2):
             part = tmp_path / "e" / f"{cell}-s{seed}" / "2026-01-01_00-00-00"
             write_part(part, whole_run(tracking + 0.001 * seed, track_angular=seed))
-    assert run_script(tmp_path / "e", "--out", tmp_path / "out") == 0
+    assert run_report(tmp_path / "e", "--out", tmp_path / "out", root=tmp_path)[0] == 0
     text = (tmp_path / "out" / "report.md").read_text()
     rows = text.partition("\n## Differences to PD\n")[2].partition("\n## ")[0].splitlines()
     tracked = [row.split(" | ")[:3] for row in rows if row.startswith("|")]
@@ -165,7 +166,7 @@ def test_rough_ground(tmp_path):
     write_grounds(folder / f"{tasks[0]}-low-s2", {("pits", 0.0): 0.5, ("pits", 0.5): 0.25, ("gaps", 0.5): 0.0})
     write_grounds(folder / f"{tasks[1]}-low-s1", {("pits", 0.0): 0.75, ("pits", 0.5): 0.25, ("gaps", 0.5): 1.0})
     (folder / f"{tasks[1]}-low-s2" / "grounds.json").write_text('{"grounds": [{}]}')
-    assert run_script(folder, "--out", tmp_path / "out") == 0
+    assert run_report(folder, "--out", tmp_path / "out", root=tmp_path)[0] == 0
     text = (tmp_path / "out" / "report.md").read_text()
     assert "Table I" not in text and "## While training" in text and "![Success in low](successinlow.png)" in text
     rows = [line for line in text.splitlines() if line.startswith(("| PD, blind |", "| Default torque, scan |"))]
@@ -200,7 +201,7 @@ def test_conditions_and_sweeps(tmp_path):
         if task != "a1_position":
             (cell / "condition_a_drop.json").write_text(json.dumps({"steps": 1, "metrics": nothing}))
     (folder / "a1_torque-low-s3" / "condition_dead_leg.json").write_text("{}")
-    assert run_script(folder, "--out", tmp_path / "out") == 0
+    assert run_report(folder, "--out", tmp_path / "out", root=tmp_path)[0] == 0
     text = (tmp_path / "out" / "report.md").read_text()
     table = text.partition("## Other conditions")[2]
     assert "| method | noise | a_drop |" in table and "| PD | 0.820 [0.810, 0.830] | – |" in table
@@ -221,15 +222,14 @@ def test_conditions_and_sweeps(tmp_path):
         ("", ["--videos=nowhere"], "there is no video in 'nowhere' that is named <task>.gif, <task>.mp4"),
     ],
 )
-def test_mistakes(tmp_path, capsys, plan, words, message):
+def test_mistakes(tmp_path, plan, words, message):
     """A mistake is one line, with exit status 2, and nothing is written."""
     if plan is not None:
         write_experiment(tmp_path / "e")
         if plan:
             (tmp_path / "e" / "experiment.yaml").write_text(plan)
-    assert run_script(tmp_path / "e", "--out", tmp_path / "out", *words) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and error.count("\n") == 1 and message in error
+    result = run_report(tmp_path / "e", "--out", tmp_path / "out", *words, root=tmp_path)
+    assert_told_in_one_line(result, message)
     assert not (tmp_path / "out").exists()
 
 

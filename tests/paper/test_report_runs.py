@@ -1,7 +1,7 @@
 """Reports on runs of train.py without a plan."""
 
 import pytest
-from support.reports import Page, line, run_script, whole_run, write_grounds, write_run
+from support.reports import Page, line, run_report, whole_run, write_grounds, write_run
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.paper.report.experiment import read_experiment
@@ -66,10 +66,11 @@ def test_runs_without_a_plan(logs):
     assert [run.cell.task for run in single.runs] == ["other"] and len(single.runs[0].rows) == 5
 
 
-def test_report_on_runs(logs, capsys):
+def test_report_on_runs(logs):
     """Without --out it lies beside the runs; it names ranges and trainings, and the paper nowhere. Tiles are in it."""
     write_grounds(logs / "other" / "2026-01-07_00-00-00", {("pits", 0.0): 1.0, ("pits", 0.5): 0.5})
-    assert run_script(logs) == 0 and "report/report.md, report.html" in capsys.readouterr().out
+    status, output, _ = run_report(logs, root=logs)
+    assert status == 0 and "report/report.md, report.html" in output
     text = (logs / "report" / "report.md").read_text()
     assert "| task | pits | all |\n| --- | --- | --- |\n| `mine` | – | – |\n| `other` | 0.75 (1) | 0.75 (1) |" in text
     table = next(table for table in Page((logs / "report" / "report.html").read_text()).tables if "method" in table[0])

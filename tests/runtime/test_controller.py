@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.control import JOINTS
 from support.exports import export_random
-from support.simulated import RATE, World, standing_at_once
+from support.simulated import RATE, World, robot_of, standing_at_once
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
@@ -160,6 +160,15 @@ FAULTS = {
     "program": lambda world: setattr(world.controller.brakes, "max_tilt", "a mistake in the program"),
     "operator": lambda world: world.controller.request(Mode.DAMPING) and None,
 }
+
+
+@pytest.mark.parametrize("rate", [300.0, 400.0, 450.0, 2000.0])
+def test_time_passes_for_the_robot(policy, rate):
+    """As for the program, however many commands a second it sends: its physics divide their time evenly."""
+    robot = robot_of(policy, rate=rate)
+    for _ in range(60):
+        robot.step(Received())
+    assert robot.data.time == pytest.approx(60 / rate)
 
 
 def test_every_fault_ends_in_damping(policy):

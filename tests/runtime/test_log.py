@@ -13,6 +13,7 @@ from support.simulated import RATE, Simulated, robot_of
 from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.interface import Received
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.replay import same_actions, simulate
 
@@ -74,6 +75,27 @@ def test_where_they_part(policy, recorded):
     assert np.array_equal(gap.simulated[before], gap.logged[before]) and not gap.rms(DEAD / RATE).any()
     parts = gap.parts_at(0.02)
     assert DEAD / RATE < parts[policy.joint_order.index("RR_calf_joint")] == parts.min() < DEAD / RATE + 0.1
+
+
+def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path):
+    """A simulated robot under the commands of a log does the same, whatever time lies between them."""
+    robot = robot_of(policy)
+    controller, ticks = Controller(policy, policy.joint_order, RATE), 0
+    session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
+    for number in range(300):
+        late = number % 20 // 19 * 4
+        for _ in range(late):
+            robot.step(Received())
+        ticks += 1 + late
+        session.tick(ticks / RATE, missed=late > 0)
+        session.log.write()
+        if number == 5:
+            assert controller.request(Mode.STAND) == ""
+    session.log.close()
+    assert controller.mode == Mode.STAND
+    gap = simulate(RecordedLog(tmp_path / "log.mcap"), robot_of(policy))
+    assert len(gap.times) == 300 and np.ptp(gap.logged, axis=0).max() > 0.1
+    np.testing.assert_allclose(gap.simulated, gap.logged, atol=1e-12)
 
 
 def test_mistakes(policy, recorded, tmp_path, monkeypatch):

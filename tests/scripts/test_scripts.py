@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import shutil
 import signal
 import subprocess
 import threading
@@ -64,6 +65,20 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
     assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (9, "none", 4)
+
+
+def test_resume_with_other_worlds_or_more_steps(tmp_path):
+    """Without ``--max_iterations``, a resumed run makes the steps of its settings, whatever an iteration has."""
+    words = [*SMALL[:-1], "--set=runner.total_steps=16", "--set=runner.save_interval=1", "--logger=none"]
+    assert run_here("train.py", *words, root=tmp_path)[0] == 0
+    (run,) = (tmp_path / "logs" / "a1_position").iterdir()
+    for change, iterations, steps in (("--num_envs=1", 3, 16), ("--set=runner.total_steps=24", 3, 24)):
+        words = ["--device=cpu", f"--load_run={run}", "--checkpoint=1", "--resume", change]
+        assert run_here("train.py", *words, f"--run_name={iterations}", root=tmp_path)[0] == 0
+        new = max((tmp_path / "logs" / "a1_position").iterdir())
+        state = torch.load(new / f"model_{iterations}.pt", weights_only=True)
+        assert (state["iter"], state["infos"]["total_timesteps"]) == (iterations, steps)
+        shutil.rmtree(new)
 
 
 def test_nobody_reads_on(tmp_path):

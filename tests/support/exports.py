@@ -1,17 +1,16 @@
 """Exports of random policies, for tests; importing this skips a module where the extra is not installed."""
 
-import xml.etree.ElementTree as ElementTree
-from pathlib import Path
-
 import pytest
 import torch
 
 for package in ("onnx", "onnxruntime", "jsonschema"):
     pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[export]")
 
+from legged_torque import RESOURCES_DIR
 from legged_torque.deploy.export import export_policy
 from legged_torque.envs import task_registry
 
+XML = RESOURCES_DIR / "robots/a1/a1.xml"
 TRAINING = {"run": "run", "checkpoint": "model_7.pt", "iterations": 7, "total_steps": 20_000_000}
 
 
@@ -51,14 +50,3 @@ def change(path, value):
             description[last] = value
 
     return apply
-
-
-XML = Path(__file__).resolve().parents[2] / "resources" / "robots" / "a1" / "a1.xml"
-
-
-def changed_xml(folder, change):
-    """The A1's MJCF with a change of its tree, as a file."""
-    tree = ElementTree.parse(XML)
-    change(tree.getroot())
-    tree.write(folder / "robot.xml")
-    return folder / "robot.xml"

@@ -82,11 +82,6 @@ def make_runner(device, *words, log_root=None):
     return task_registry.make_alg_runner(env, train_cfg=train_cfg, log_root=log_root)[0]
 
 
-def sim_of(env):
-    """The simulator of a task."""
-    return env.sim
-
-
 def use_graphs(env, on):
     """Choose whether control steps of a task replay as a CUDA graph."""
     env.step_graph.enabled = on

@@ -1,18 +1,14 @@
 """Made-up results of experiments and runs, and a reader of HTML pages."""
 
 import json
-import runpy
-import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
-import pytest
 import yaml
+from support.scripts import run_here
 
 from legged_torque.paper.report.evaluations import METRIC_NAMES
 from legged_torque.paper.values import TABLE_I
 
-SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "report.py"
 HEADER = ",".join(["steps,iteration,seconds", *METRIC_NAMES])
 SETTINGS = {
     "env": {"env": {"num_envs": 1000}},
@@ -79,15 +75,9 @@ def write_grounds(cell, crossed):
     (cell / "grounds.json").write_text(json.dumps({"grounds": entries}))
 
 
-def run_script(*words):
-    """Run the script in this process; return its exit status."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["report.py", *map(str, words)])
-        try:
-            runpy.run_path(str(SCRIPT), run_name="__main__")
-        except SystemExit as stop:
-            return stop.code
-    return 0
+def run_report(*words, root):
+    """Run the script in a folder; return its status, output and errors."""
+    return run_here("report.py", *map(str, words), root=root)
 
 
 class Page(HTMLParser):

@@ -51,11 +51,3 @@ def get(section, path):
     for key in path.split("."):
         section = section[key] if isinstance(section, dict) else getattr(section, key)
     return section
-
-
-def flatten(values, path=""):
-    """Nested dictionaries as one of dotted paths."""
-    result = {}
-    for key, value in values.items():
-        result |= flatten(value, f"{path}{key}.") if isinstance(value, dict) and value else {f"{path}{key}": value}
-    return result

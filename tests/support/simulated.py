@@ -10,9 +10,9 @@ from legged_torque.runtime.sim_robot import SimRobot
 RATE = 500.0
 
 
-def robot_of(policy, order=None, **options):
+def robot_of(policy, order=None, rate=RATE, **options):
     """The robot that a policy was trained for, lying; it has an order of joints of its own."""
-    return SimRobot(resource_path(policy.description["robot"]["file"]), order or policy.joint_order, RATE, **options)
+    return SimRobot(resource_path(policy.description["robot"]["file"]), order or policy.joint_order, rate, **options)
 
 
 class Simulated(Session):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.ground import ground_cfg, make_ground, rays
-from support.settings import error_of, flatten
+from support.settings import error_of
 
 from legged_torque.envs.base.evaluation import evaluation_cfg
 from legged_torque.envs.base.validation import check_env_cfg
@@ -18,7 +18,7 @@ from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.rough import make_terrain
 from legged_torque.terrain.tiles import TILES, Grid
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.task_registry import task_registry
 
 GRID = Grid(160, 0.05)
@@ -229,7 +229,7 @@ def test_levels_stay_in_evaluations():
 @pytest.fixture
 def make_rough_task(make_task):
     """Factory of tasks on stairs."""
-    cfg = flatten({"terrain": to_dict(ground_cfg(terrain_proportions={"rough_slope": 0.0, "stairs_up": 1.0}).terrain)})
+    cfg = flat({"terrain": to_dict(ground_cfg(terrain_proportions={"rough_slope": 0.0, "stairs_up": 1.0}).terrain)})
     return lambda num_envs, **changes: make_task("a1_position", num_envs, **(cfg | changes))
 
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 import yaml
-from support.settings import TASKS, error_of, flatten, get, get_cfgs, parse
+from support.settings import TASKS, error_of, get, get_cfgs, parse
 
 from legged_torque.envs import task_registry
-from legged_torque.utils.config import BaseConfig, Section, section_keys, to_dict
+from legged_torque.utils.config import BaseConfig, Section, flat, section_keys, to_dict
 from legged_torque.utils.task_registry import num_iterations
 
 TABLES = yaml.safe_load(Path(__file__).with_name("config.yaml").read_text("utf-8"))
@@ -25,7 +25,7 @@ def test_overrides(path, text, value):
     if isinstance(value, list):
         assert [type(item) for item in result] == [type(item) for item in value]
     for new, old in zip(changed, default, strict=True):
-        new, old = flatten(to_dict(new)), flatten(to_dict(old))
+        new, old = flat(to_dict(new)), flat(to_dict(old))
         assert {key for key in old if new.get(key) != old[key]} <= {path} and new.keys() == old.keys()
 
 

@@ -1,6 +1,7 @@
 """Policies that others publish: up to a stand-in for the Hugging Face Hub, and down from there."""
 
 import functools
+import shutil
 
 import pytest
 import yaml
@@ -90,6 +91,13 @@ def test_mistakes(script, tmp_path, words, expected):
     """One line, status 2, and nothing written."""
     assert_told_in_one_line(script(*words), expected)
     assert not [*(tmp_path / "here").iterdir()]
+
+
+def test_an_export_in_the_folder_of_the_command(script, tmp_path):
+    """It is published by the name of its file alone."""
+    shutil.copytree(policy_dir("a1/position"), tmp_path / "here", dirs_exist_ok=True)
+    status, _, errors = script("publish.py", "policy.onnx", "--out=../out")
+    assert status == 0 and {path.name for path in (tmp_path / "out").iterdir()} >= FILES, errors
 
 
 def test_no_network(script, monkeypatch):

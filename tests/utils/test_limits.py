@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 import pytest
 import yaml
-from support.settings import COMBINATIONS, TASKS, error_of, flatten, get, get_cfgs
+from support.settings import COMBINATIONS, TASKS, error_of, get, get_cfgs
 
 from legged_torque.envs.base.validation import check_env_cfg
-from legged_torque.utils.config import Section, set_by_path, to_dict
+from legged_torque.utils.config import Section, flat, set_by_path, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Count, Interval, Limits, Positive
 
@@ -29,7 +29,7 @@ def test_no_number_may_be_anything(bad):
     checked = set()  # settings of all tasks, each in the first task that has it
     for task in TASKS + COMBINATIONS:
         for i, cfg in enumerate(get_cfgs(task=task)):
-            for path, value in flatten(to_dict(cfg)).items():
+            for path, value in flat(to_dict(cfg)).items():
                 wrong = with_bad_number(value, bad)
                 by_name = bad == {} and path.startswith(("control.", "motors."))  # joints, which the task refuses
                 others = path.startswith("init_state.default_joint_angles.") or (i, path) in checked

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from support.settings import error_of, flatten, get_cfgs
+from support.settings import error_of, get_cfgs
 
 from legged_torque import __version__
 from legged_torque.utils import runs
-from legged_torque.utils.config import to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.files import write_whole
 
 
@@ -73,7 +73,7 @@ def test_config_file_round_trip(task, tmp_path, monkeypatch):
     config = runs.load_config(tmp_path / "run")
     loaded = get_cfgs(task=task, run_config=config)
     for new, old in zip(loaded, (env_cfg, train_cfg), strict=True):
-        new, old = flatten(to_dict(new)), flatten(to_dict(old))
+        new, old = flat(to_dict(new)), flat(to_dict(old))
         assert new == old
         assert {key: type(value) for key, value in new.items()} == {key: type(value) for key, value in old.items()}
     assert config["task"] == task

@@ -302,11 +302,11 @@ def test_a_video_is_downloaded(browser, tmp_path):
             lines = iter(process.stdout.readline, "")
             open_page(browser, next(line for line in lines if "See it walk" in line).split()[3])
             set_pause(browser, True, lambda: "paused" in text_of(browser))  # else typing takes half a minute
-            type_into(browser, "speed [x]", "0.1")  # few steps, since the page is slow
+            type_into(browser, "speed [x]", "0.05")  # few steps, since the page is slow
             click(browser, "Record")
             wait_for(lambda: "Stop and download" in text_of(browser))
             start = simulated_time(browser)
-            set_pause(browser, False, lambda: simulated_time(browser) > start + 0.2)
+            set_pause(browser, False, lambda: simulated_time(browser) > start + 0.1)
             set_pause(browser, True, lambda: "paused" in text_of(browser))
             click(browser, "Stop and download")
             file = browser.downloads / "walking.mp4"

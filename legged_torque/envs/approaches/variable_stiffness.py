@@ -6,7 +6,6 @@ import torch
 import warp as wp
 
 from legged_torque.envs.approaches.variable_stiffness_config import VariableStiffnessCfg as VariableStiffnessCfg
-from legged_torque.envs.approaches.variable_stiffness_config import VariableStiffnessCfgPPO as VariableStiffnessCfgPPO
 from legged_torque.envs.base.actions import ActionTerm, PdControl, pd_target, position_residual
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.kernel import read

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.utils.limits import Limits, Positive
 
 
@@ -14,7 +14,3 @@ class VariableStiffnessCfg(LeggedRobotCfg):
         stiffness_scale: Positive = 5.0  # [N m/rad] per unit of a stiffness action; ours, as is the range
         stiffness_range: Annotated[list[float], Limits(0, 1000, ordered=True)] = [10.0, 60.0]  # [N m/rad]
         damping = 0.2  # Kd per square root of Kp, the paper's number
-
-
-class VariableStiffnessCfgPPO(LeggedRobotCfgPPO):
-    """Training of variable stiffness: that of the robot."""

@@ -30,6 +30,15 @@ class CommandsCfg(Section):
         ranges, self.fixed = self.ranges, list(command)
         ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw = ([value, value] for value in command)
 
+    def allowed(self) -> dict[str, list[float]]:
+        """Return lowest and highest v_x, v_y [m/s] and yaw rate [rad/s] by name: of the ranges, or the one command."""
+        ranges = {name: list(getattr(self.ranges, name)) for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")}
+        return ranges if self.fixed is None else dict(zip(ranges, ([v, v] for v in self.fixed), strict=True))
+
+    def has_headings(self) -> bool:
+        """Return whether yaw rates turn to headings."""
+        return self.heading_command and self.fixed is None
+
     def build(self, task: Any) -> Any:
         """Return the :class:`~legged_torque.envs.base.commands.UniformCommands` of a task, or one derived from it."""
         return pkgutil.resolve_name("legged_torque.envs.base.commands:UniformCommands")(self, task)

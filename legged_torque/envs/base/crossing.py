@@ -75,7 +75,7 @@ class Grounds:
         cfg.env.episode_length_s = self.time_limit(terrain.tile_size) + 1.0  # no trial ends with the episode
         cfg.commands.resampling_probability = cfg.commands.standing_share = cfg.commands.zero_below = 0.0
         ranges.lin_vel_x, ranges.lin_vel_y = ([speed, speed] for speed in self.command)
-        cfg.commands.heading_command = True
+        cfg.commands.heading_command, cfg.commands.fixed = True, None
         cfg.domain_rand.init_yaw = [0.0, 0.0]
         return cfg
 

@@ -151,7 +151,7 @@ class CommandBreakdown:
 
 def num_tracked(task: WalkingTask) -> int:
     """Return how many of a task's commands count for the tracking percentage, the yaw rate being the last."""
-    return 2 if task.cfg.commands.heading_command else 3
+    return 2 if task.cfg.commands.has_headings() else 3
 
 
 def measure(

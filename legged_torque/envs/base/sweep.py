@@ -34,6 +34,9 @@ class Sweep:
         """Start with empty sums; a UserError if the parameter has one value only, or several numbers of its own."""
         setting = DELAYS.get(name, f"domain_rand.{name}")
         kinds = (task.events.parameters, task.events.initial_state)
+        other = next((each.same_draw_as for kind in kinds for each in kind.parameters if each.name == name), None)
+        if other:
+            raise UserError(f"{name} has no draw of its own, but that of {other}: sweep {other}")
         drawn = next((kind for kind in kinds if name in kind.sizes), None)
         if drawn is None:
             raise UserError(f"{name} is always 0: give {setting} a range with --set")

@@ -91,7 +91,7 @@ def unread_columns(name: str) -> int:
 class State:
     """The worlds: fields of MuJoCo Warp's data, one row per world."""
 
-    # In, or out with a law for torques:
+    # In:
     ctrl: wp.array2d(dtype=wp.float32)
     # In and out:
     qpos: wp.array2d(dtype=wp.float32)
