@@ -85,7 +85,7 @@ def main() -> None:
     if args.log:
         from legged_torque.runtime.log import Log
 
-        log = Log(args.log, controller)
+        log = Log(args.log, controller, keeps_time=args.interface != "sim")
     session = Session(controller, transport, log)
     loop = RealTimeLoop(args.rate, session.tick)
     chirps = [policy] if args.chirp else []

@@ -173,7 +173,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         raise UserError(f"the run has all of its {counted(done, 'iteration')}; to go on: {further}")
     if is_first:
         if env.device == "cpu":
-            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not options.max_iterations
+            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not (options.max_iterations or options.resume)
             threads = max(torch.get_num_threads(), distributed.world_size())
             print_notes([LONG_NOTE if is_long else "", busy_cores_note(threads)])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
@@ -202,6 +202,7 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     device, num_processes = runner.env.device, distributed.world_size()
     settings = {"task": options.task, "preset": options.preset or DEFAULT_PRESET, "device": device}
     settings |= {"device_name": device_name(device), "processes": num_processes, "max_iterations": total}
+    settings["given_iterations"] = options.max_iterations
     runner.claim_log_dir(settings | {"env": to_dict(env_cfg), "train": to_dict(train_cfg)})
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     worlds = counted(num_processes * runner.env.num_envs, "world")

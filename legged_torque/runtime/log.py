@@ -40,8 +40,11 @@ class Log:
 
     problem = ""
 
-    def __init__(self, file: Path, controller: Controller) -> None:
-        """Begin a file; a UserError if it exists, or its folder does not."""
+    def __init__(self, file: Path, controller: Controller, keeps_time: bool = True) -> None:
+        """Begin a file; a UserError if it exists, or its folder does not.
+
+        ``keeps_time`` says whether the robot goes on while the program is late.
+        """
         try:
             self._file = file.open("xb")
         except OSError as error:
@@ -52,18 +55,19 @@ class Log:
         description = controller.policy.description
         names = orjson.dumps(controller.joints.names).decode()
         about = {"joint_order": names, "sha256": description["network"]["sha256"], "task": description["task"]}
-        self._writer.add_metadata(ROBOT, about | {"period": repr(controller.period)})
+        about |= {"period": repr(controller.period), "keeps_time": str(keeps_time)}
+        self._writer.add_metadata(ROBOT, about)
         schema = self._writer.register_schema("object", "jsonschema", b'{"type": "object"}')
         self._channels = {name: self._writer.register_channel(name, "json", schema) for name in (TICK, POLICY)}
 
-    def add(self, now: float, missed: bool, received: Received) -> None:
-        """Keep a tick that has just been made, at a time [s]."""
+    def add(self, now: float, missed: bool, received: Received, command: MotorCommand) -> None:
+        """Keep a tick that has just been made, at a time [s], and the command that was sent."""
         controller, step = self._controller, self._controller.policy_step
         state = received.newest if isinstance(received.newest, RobotState) else None
         tick: dict[str, Any] = {"mode": controller.mode.value, "reason": controller.reason, "missed": missed}
         tick |= {"damaged": received.wrong_crc, "lost": received.lost, "late": received.late}
         tick |= {"velocity_command": controller.velocity_command.copy()}
-        self._waiting.append((TICK, now, tick | {"state": state, "command": controller.sent}))
+        self._waiting.append((TICK, now, tick | {"state": state, "command": command}))
         if step is not None:
             self._waiting.append((POLICY, now, vars(step)))
 
@@ -97,6 +101,7 @@ class RecordedLog:
         sha256: Of the policy's network.
         task: That the policy was trained on.
         period: Time between two ticks [s].
+        keeps_time: Whether the robot went on while the program was late.
     """
 
     def __init__(self, file: Path) -> None:
@@ -106,6 +111,7 @@ class RecordedLog:
             about = next(each.metadata for each in self._records() if isinstance(each, Metadata) and each.name == ROBOT)
             self.joint_order: list[str] = orjson.loads(about["joint_order"])
             self.sha256, self.task, self.period = about["sha256"], about["task"], float(about["period"])
+            self.keeps_time = about.get("keeps_time") != "False"
         except OSError as error:
             raise UserError(f"cannot read '{file}': {error.strerror}") from None
         except (McapError, StopIteration, KeyError, ValueError) as error:

@@ -46,7 +46,8 @@ class Operator(contextlib.AbstractContextManager["Operator"]):
         """Take the controller that obeys."""
         self._controller = controller
         ranges = controller.policy.description["commands"]
-        self._low, self._high = np.array([ranges[name] for name in NAMES], float).T
+        low, high = np.array([ranges[name] for name in NAMES], float).T
+        self._low, self._high = np.minimum(low, 0.0), np.maximum(high, 0.0)  # any robot may be told to stand
 
     def __exit__(self, *exception: object) -> None:
         """Give the device back."""

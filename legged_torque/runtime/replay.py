@@ -52,7 +52,8 @@ class Gap:
 def simulate(log: RecordedLog, robot: SimRobot) -> Gap:
     """Give a simulated robot, which lies as that of the log at its start, all commands of the log, each in time.
 
-    Where the program was late, the robot has gone on under the command before. A UserError if the log has no states.
+    Where the program was late, a robot that keeps time has gone on under the command before. A UserError if the log has
+    no states.
     """
     times, logged, simulated = [], [], []
     state, start = None, 0.0
@@ -61,9 +62,9 @@ def simulate(log: RecordedLog, robot: SimRobot) -> Gap:
             robot.lie_down(newest.joint_positions)
             start = time
         state = newest or state
-        late = (time - start - robot.data.time) / log.period if state is not None else 0.0
-        for _ in range(round(late)):
-            robot.step(Received())
+        if state is not None and log.keeps_time:
+            for _ in range(round((time - start - robot.data.time) / log.period)):
+                robot.step(Received())
         said, _ = robot.says()
         if state is not None and said is not None:
             times.append(time)

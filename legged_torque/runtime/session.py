@@ -43,11 +43,12 @@ class Session:
         self.counts.update(new | {"lost": received.lost, "late": received.late, "missed deadlines": int(missed)})
         before = self.controller.reason
         self.controller.step(received, now, missed)
-        self._transport.send(self.controller.command_at(self._clock()))
+        command = self.controller.command_at(self._clock())
+        self._transport.send(command)
         if self.controller.reason and self.controller.reason != before:
             self.stops.append(self.controller.reason)
         if self.log:
-            self.log.add(now, missed, received)
+            self.log.add(now, missed, received, command)
 
     def close(self) -> None:
         """Leave the robot in damping, after the loop has ended."""

@@ -98,6 +98,7 @@ class SimRobot:
     def lie_down(self, joint_positions: np.ndarray | None = None) -> None:
         """Lay the robot on its belly, with folded legs, or with these joint positions [rad]. Shape: (joints,)."""
         mujoco.mj_resetData(self.model, self.data)
+        self._on_their_way.clear()  # their times are of the clock before
         low, high = self.model.jnt_range[[self.model.joint(name).id for name in self.joint_order]].T
         folded = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
         self.data.qpos[self._qpos] = np.clip(folded, low, high) if joint_positions is None else joint_positions

@@ -186,7 +186,9 @@ def steps_per_iteration(config: dict[str, Any]) -> int | None:
 
 def given_iterations(config: dict[str, Any]) -> int | None:
     """Return how many iterations a run was told to make; None if they are what its settings say, or unknown."""
-    iterations, steps = config.get("max_iterations"), steps_per_iteration(config)
+    if "given_iterations" in config:
+        return config["given_iterations"]
+    iterations, steps = config.get("max_iterations"), steps_per_iteration(config)  # of an older run
     try:
         is_of_settings = 0 <= iterations * steps - config["train"]["runner"]["total_steps"] < steps  # type: ignore[operator]
     except (KeyError, TypeError):

@@ -1,5 +1,6 @@
 """Numbers in the documents of the preset laptop, against the data."""
 
+import json
 from itertools import product
 
 import numpy as np
@@ -87,6 +88,8 @@ def test_half_of_the_mirror_images():
     today = f"{KEPT} fade 4-10M"
     whole, half = (walking.loc[256, 24].xs(name, level="other") for name in (today, f"{today} half images"))
     runs = [(task, seed) for task in data["task"].unique()[:3] for seed in range(5, 11)]
+    made = data[data["other"].isin([today, f"{today} half images"])].groupby(SETTINGS)[["task", "seed"]]
+    assert (made.apply(lambda rows: len(rows.drop_duplicates())) == len(runs)).all() and made.ngroups == 6
     ratios = {}
     for kind in half.index.droplevel(["task", "seed"]).unique():
         steps = (np.log(of.loc[place].reindex(runs).fillna(7.5)) for of, place in ((half, kind), (whole, (4, 5))))
@@ -101,10 +104,19 @@ def test_half_of_the_mirror_images():
     assert f"up to {lost.max():.2f} lower ({len(lost)} pairs)" in text and lost.min() > -0.005
     curves = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('half/')")
     ends = curves.groupby(["task", "seed"]).apply(at_the_end)
-    before = pd.read_csv(DOCS / "results" / "evaluations.csv.xz").query("environment == 'low'")
-    before = before.groupby(["task", "seed"]).apply(at_the_end)
+    evaluations = pd.read_csv(DOCS / "results" / "evaluations.csv.xz").query("environment == 'low'")
+    before = evaluations.groupby(["task", "seed"]).apply(at_the_end)
     changes = (ends - before).dropna()
     assert len(ends) == 12 and len(changes) == 9 and -0.015 < changes.mean() < -0.005
+    assert "ends 0.01 lower (9 pairs)" in text
+    curves, before = (rows[rows["track_percentage"] >= 0.7] for rows in (curves, evaluations))
+    first, second = (rows.groupby(["task", "seed"])["steps"].min() for rows in (curves, before))
+    ratio = np.exp(np.log(first / second).dropna().mean())
+    assert f"needs about {ratio:.1f} times the steps" in text
+    measured = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
+    rows = [row for each in measured if each.get("commit") == "20c226a" for row in each["rows"]]
+    ms = [row["update_ms"] for images in ("half", "all") for row in rows[::2] if row["images"] == images]
+    assert f"update takes [{ms[0]:.1f} instead of {ms[1]:.1f} ms]" in text
 
 
 def after(seconds):
@@ -124,13 +136,13 @@ def test_laptop():
     last = data[(data["steps"] > 0.82 * 20e6) & (data["seed"] == 1)].groupby("task")["track_percentage"]
     assert (last.size() == 8).all()
     ends = [f"{end:.2f}" for end in last.mean()]
-    text = text_of("getting_started.md", "Seed 1 ended at")
+    text = text_of("getting_started.md", "last 18% of the steps, seed 1 tracked")
     assert text.startswith(f"{ends[0]} (A1, ") and f" and {ends[1]} (Go2" in text
     assert "tracks {} (A1) and {} (Go2) at the end".format(*ends) in text_of("tried.md", "**At the end of 20 million")
     runs, _ = laptop_settings()
     ends = runs[runs["other"] == f"{KEPT} fade 4-10M 20M"].groupby(["task", "seed"]).apply(at_the_end)[:, 1]
     rough = ends.pop("a1_rough_torque_multihead")
-    assert f"tasks (seed 1) ended at {ends.min():.2f} (`{ends.idxmin()}`) to {ends.max():.2f}, on rough ground" in text
+    assert f"tasks (seed 1) ended at {ends.min():.2f} (`{ends.idxmin()}`) to {ends.max():.2f}, one" in text
     assert f"on rough ground at {rough:.2f} " in text and len(ends) == 11
 
 

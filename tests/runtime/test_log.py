@@ -77,14 +77,15 @@ def test_where_they_part(policy, recorded):
     assert DEAD / RATE < parts[policy.joint_order.index("RR_calf_joint")] == parts.min() < DEAD / RATE + 0.1
 
 
-def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path):
+@pytest.mark.parametrize("keeps_time", [True, False])
+def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path, keeps_time):
     """A simulated robot under the commands of a log does the same, whatever time lies between them."""
     robot = robot_of(policy)
     controller, ticks = Controller(policy, policy.joint_order, RATE), 0
-    session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
+    session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller, keeps_time))
     for number in range(300):
         late = number % 20 // 19 * 4
-        for _ in range(late):
+        for _ in range(late * keeps_time):
             robot.step(Received())
         ticks += 1 + late
         session.tick(ticks / RATE, missed=late > 0)

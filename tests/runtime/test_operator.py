@@ -33,6 +33,22 @@ def does(robot):
     return robot.run(10), robot.controller.velocity_command.round(4).tolist()
 
 
+def test_a_policy_for_one_command(robot):
+    """Its robot may be told to stand, and nothing else."""
+    ranges = {"lin_vel_x": [0.5, 0.5], "lin_vel_y": [0.0, 0.0], "ang_vel_yaw": [-0.2, -0.2]}
+    policy, description = robot.controller.policy, robot.controller.policy.description
+    policy.description = description | {"commands": description["commands"] | ranges}
+    try:
+        asks = operator.Operator(robot.controller)
+    finally:
+        policy.description = description
+    for command, given in ((STILL, STILL), ([1.0, 1.0, 1.0], [0.5, 0.0, 0.0]), ([-1.0, 0.0, -1.0], [0.0, 0.0, -0.2])):
+        asks.move(command)
+        assert robot.controller.velocity_command.tolist() == given
+    asks.begin_with(STILL)
+    assert "lin_vel_x of --command must be from 0 to 0.5" in error_of(asks.begin_with, [0.6, 0.0, 0.0])
+
+
 @pytest.fixture
 def datagrams(robot, monkeypatch):
     """An operator on a free port, and what sends it something and has it look."""

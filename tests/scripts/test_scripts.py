@@ -3,7 +3,6 @@
 import math
 import os
 import re
-import shutil
 import signal
 import subprocess
 import threading
@@ -72,13 +71,20 @@ def test_resume_with_other_worlds_or_more_steps(tmp_path):
     words = [*SMALL[:-1], "--set=runner.total_steps=16", "--set=runner.save_interval=1", "--logger=none"]
     assert run_here("train.py", *words, root=tmp_path)[0] == 0
     (run,) = (tmp_path / "logs" / "a1_position").iterdir()
-    for change, iterations, steps in (("--num_envs=1", 3, 16), ("--set=runner.total_steps=24", 3, 24)):
-        words = ["--device=cpu", f"--load_run={run}", "--checkpoint=1", "--resume", change]
-        assert run_here("train.py", *words, f"--run_name={iterations}", root=tmp_path)[0] == 0
-        new = max((tmp_path / "logs" / "a1_position").iterdir())
-        state = torch.load(new / f"model_{iterations}.pt", weights_only=True)
-        assert (state["iter"], state["infos"]["total_timesteps"]) == (iterations, steps)
-        shutil.rmtree(new)
+
+    def resumed(run, checkpoint, change):
+        """The run that goes on from a checkpoint, its iterations and steps."""
+        before = set(run.parent.iterdir())
+        words = ["--device=cpu", f"--load_run={run}", f"--checkpoint={checkpoint}", "--resume", change]
+        assert run_here("train.py", *words, f"--run_name={len(before)}", root=tmp_path)[0] == 0
+        (new,) = set(run.parent.iterdir()) - before
+        state = torch.load(new / "model_3.pt", weights_only=True)
+        return new, state["iter"], state["infos"]["total_timesteps"]
+
+    fewer, *numbers = resumed(run, 1, "--num_envs=1")
+    assert numbers == [3, 16]
+    assert resumed(fewer, 2, "--num_envs=2")[1:] == (3, 20)  # from 12 steps on
+    assert resumed(run, 1, "--set=runner.total_steps=24")[1:] == (3, 24)
 
 
 def test_nobody_reads_on(tmp_path):

@@ -96,7 +96,8 @@ def write_log(file, recording, task, modes=None, times=None):
     log, nothing = Log(file, controller), np.zeros(len(recording.joint_order))
     quaternions = np.broadcast_to(recording.quaternion, (len(recording.commands), 4))
     for tick, (command, (pos, vel)) in enumerate(zip(recording.commands, recording.measured, strict=True)):
-        controller.sent, controller.mode = MotorCommand(*command), modes[tick] if modes else Mode.POLICY
+        controller.mode = modes[tick] if modes else Mode.POLICY
         state = RobotState(tick, quaternions[tick], np.zeros(3), pos, vel, nothing, nothing, nothing)
-        log.add(times[tick] if modes else PERIOD * tick, False, Received(None if np.isnan(pos).any() else state))
+        received = Received(None if np.isnan(pos).any() else state)
+        log.add(times[tick] if modes else PERIOD * tick, False, received, MotorCommand(*command))
     log.close()
