@@ -123,8 +123,9 @@ def check_combinations(args: argparse.Namespace) -> None:
         raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
     if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
-    if args.agent != "policy" and (args.load_run or args.checkpoint is not None or has_viewer):
-        raise UserError(f"--agent {args.agent} has no run: --load_run, --checkpoint and --viewer are for the policy's")
+    if args.agent != "policy" and (args.load_run or args.policy or args.checkpoint is not None or has_viewer):
+        of_policies = "--load_run, --policy, --checkpoint and --viewer"
+        raise UserError(f"--agent {args.agent} has no run: {of_policies} are for those of policies")
     if args.headless and args.viewer == "native":
         raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
     if args.compare and args.viewer != "web":

@@ -25,6 +25,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--latency", type=float, help="of its commands [ms]; default: that of a file of motors, or 0")
     parser.add_argument("--limit", type=float, default=0.1, help="gap at which they part [rad]; default: %(default)s")
     parser.add_argument("--plot", type=Path, help="figure of all joints; needs the extra 'plots'")
+    cli.add_options(parser, "task_file")
     args = parser.parse_args()
     cli.check_args(args, latency=Annotated[float, Limits(0, 1000)], limit=Positive)
     return args
@@ -33,6 +34,7 @@ def parse_args() -> argparse.Namespace:
 def main() -> None:
     """Print what has become of policy and robot."""
     args = parse_args()
+    cli.options_of(args)  # imports files of tasks
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy
         from legged_torque.envs import task_registry
@@ -43,6 +45,7 @@ def main() -> None:
     steps, equal = same_actions(log, policy)
     print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
     cfg = task_registry.get_cfgs(policy.description["task"])[0]
+    cfg.motors.restore(policy.description.get("motors", {}))
     latency = simulated_latency(cfg, args.motors, args.latency)
     xml, rate = resource_path(policy.description["robot"]["file"]), 1.0 / log.period
     gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=latency))

@@ -80,6 +80,7 @@ def main() -> None:
     policy = Policy(args.policy)
     if args.motors:
         cfg = task_registry.get_cfgs(policy.description["task"])[0]
+        cfg.motors.restore(policy.description.get("motors", {}))
         sets_delay = choose_motors(cfg, args.motors)
         policy.description["motors"] = cfg.motors.describe()
         if sets_delay:

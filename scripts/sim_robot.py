@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, NotNegative, Positive
 from legged_torque.utils.options import simulated_latency
@@ -115,11 +115,9 @@ def with_faults(faults: object, words: list[str], joints: list[str]) -> object:
     kinds = [field.name for field in dataclasses.fields(faults) if field.name != "not_finite"]  # no message can say it
     for word in words:
         name, _, value = word.partition("=")
-        if name not in kinds:
-            raise unknown_name("fault", name, kinds)
+        check_names("fault", [name], kinds)
         if isinstance(getattr(faults, name), list):
-            if value not in joints:
-                raise unknown_name("joint", value, joints)
+            check_names("joint", [value], joints)
             getattr(faults, name).append(value)
             continue
         try:

@@ -24,26 +24,26 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 219,
-    "legged_torque/deploy": 1532,
-    "legged_torque/envs": 5294,
-    "legged_torque/experiments": 1103,
+    "legged_torque/deploy": 1544,
+    "legged_torque/envs": 5281,
+    "legged_torque/experiments": 1099,
     "legged_torque/identification": 432,
     "legged_torque/importer": 1252,
-    "legged_torque/learning": 4107,
-    "legged_torque/motors": 1512,
-    "legged_torque/runtime": 2102,
+    "legged_torque/learning": 4109,
+    "legged_torque/motors": 1532,
+    "legged_torque/runtime": 2092,
     "legged_torque/sensors": 302,
-    "legged_torque/sim": 5800,
-    "legged_torque/terrain": 591,
-    "legged_torque/utils": 3332,
-    "legged_torque/viewer": 2490,
-    "scripts": 2016,
-    "paper": 3217,
-    "tools": 1508,
-    "tests": 24741,
+    "legged_torque/sim": 5790,
+    "legged_torque/terrain": 586,
+    "legged_torque/utils": 3335,
+    "legged_torque/viewer": 2485,
+    "scripts": 2019,
+    "paper": 3216,
+    "tools": 1506,
+    "tests": 24830,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_129  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_122  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -17,7 +17,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.learning import checkpoint
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import check_names
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.plain_yaml import Dumper
 from legged_torque.utils.policies import CARD, POLICIES_DIR, sha256
@@ -47,9 +47,7 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=NAMES, help="robot/approach; default: all")
     parser.add_argument("--log_root", type=Path, default=Path("logs"), help="folder of the runs; default: ./logs")
     args = parser.parse_args()
-    for name in args.names:
-        if name not in NAMES:
-            raise unknown_name("policy", name, NAMES)
+    check_names("policy", args.names, NAMES)
     for name in args.names:
         task = name.replace("/", "_")
         run("train", f"--task={task}", f"--log_root={args.log_root}", *settings(name))

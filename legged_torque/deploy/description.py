@@ -4,12 +4,13 @@ import hashlib
 import importlib.util
 import json
 import math
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names
@@ -120,9 +121,7 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
     by_joint = {key: description[key] for key in keys if key in description}
     by_joint |= {f"gains.{key}": values for key, values in description["gains"].items()}
     for path, values in by_joint.items():
-        for name in values:
-            if name not in joints:
-                raise unknown_name(f"joint in {path} of {where}", name, joints)
+        check_names(f"joint in {path} of {where}", values, joints)
         for name in joints:
             if name not in values:
                 raise UserError(f"{where}: {path} lacks the joint '{name}'")
@@ -158,3 +157,13 @@ def require(*packages: str, extra: str = "export") -> None:
     for package in packages:
         if importlib.util.find_spec(package) is None:
             raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")
+
+
+def beyond(description: dict[str, Any], observations: Container[str], actions: Container[str]) -> list[str]:
+    """Return what a program lacks that knows some terms of ``observations`` and ``actions``, and a plain network."""
+    observed, acted = description["observations"], description["actions"]["terms"]
+    problems = [f"the observation {term['name']}" for term in observed["terms"] if term["name"] not in observations]
+    problems += [f"the actions {term['name']}" for term in acted if term["name"] not in actions]
+    problems += [f"an interval of {term['name']}" for term in acted if term.get("interval", 1) > 1]
+    problems += ["a history of observations"] if observed["history_length"] > 1 else []
+    return problems + (["a recurrent network"] if "memory" in description["network"] else [])

@@ -137,9 +137,12 @@ class Policy:
         """Return joint torques [N m] for actions of :meth:`act`, clipped to the limits. Shape: (joints,).
 
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
-        ``policy.yaml`` are left out: a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
+        ``policy.yaml`` are left out, since a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
         """
-        return np.clip(self.wanted_torques(actions, joint_positions, joint_velocities), *self.torque_limits)
+        stiffness, damping = self._drive_gains
+        wanted = self.wanted_torques(actions, joint_positions, joint_velocities)
+        held = stiffness * (self.nominal_pose - self.joints(joint_positions)) - damping * self.joints(joint_velocities)
+        return np.clip(wanted + held, *self.torque_limits)
 
     def wanted_torques(
         self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray

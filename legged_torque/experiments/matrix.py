@@ -12,7 +12,7 @@ from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options, draw_only
 from legged_torque.utils.plain_yaml import parse_yaml
@@ -166,9 +166,7 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
         options.preset, options.ranges, options.set = matrix.preset, matrix.ranges, words
         env_cfg, _ = task_registry.get_cfgs(cell.task, options)
         check_env_cfg(env_cfg)
-        for name in cell.evaluated_in:
-            if name not in env_cfg.perturbations():
-                raise unknown_name("perturbation", name, env_cfg.perturbations())
+        check_names("perturbation", cell.evaluated_in, env_cfg.perturbations())
         for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
             options.set = [*words, *set_words(settings)]
             check_env_cfg(changed := task_registry.get_cfgs(cell.task, options)[0])
@@ -188,13 +186,11 @@ def read_plan(file: Path) -> Matrix:
     if not isinstance(values, dict) or not {"tasks", "environments", "seeds"} <= values.keys():
         raise UserError(f"'{file}' must hold the keys tasks, environments and seeds, and may hold {', '.join(KEYS)}")
     for key, value in values.items():
-        if key not in KEYS:
-            raise unknown_name("experiment key", str(key), KEYS)
+        check_names("experiment key", [key], KEYS)
         values[key] = check_value(key, value, KEYS[key])
     for section, defaults in {"evaluation": EVALUATION, "grounds": GROUNDS}.items():
         for key, value in values.get(section, {}).items():
-            if key not in defaults:
-                raise unknown_name(f"{section} key", str(key), defaults)
+            check_names(f"{section} key", [key], defaults)
             values[section][key] = check_value(f"{section}.{key}", value, TYPES[key])
             if value == []:
                 raise UserError(f"{section}.{key} must hold one entry or more, not {value}")

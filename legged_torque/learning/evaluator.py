@@ -16,7 +16,7 @@ from legged_torque.learning.memory import acting
 from legged_torque.learning.protocols import Evaluation
 from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.files import append_whole
 from legged_torque.utils.runs import tagged
 
@@ -147,8 +147,7 @@ def make_evaluators(task: Any, policy: Policy, settings: dict, seed: int, captur
         raise UserError(f"{type(task).__name__} has no make_evaluation() for evaluations; set evaluation.interval=0")
     for key, names in {"perturbation": [settings["perturbation"]], "also": settings["also"]}.items():
         for name in filter(None, names):
-            if name not in task.cfg.perturbations():
-                raise unknown_name(f"evaluation.{key}", name, task.cfg.perturbations())
+            check_names(f"evaluation.{key}", [name], task.cfg.perturbations())
     names = enumerate(dict.fromkeys(["", *settings["also"]]), 1)
     return [TrainingEvaluator(task, policy, settings, seed + SEED * i, name, capture) for i, name in names]
 

@@ -12,7 +12,7 @@ from legged_torque.learning.memory import acting
 from legged_torque.learning.protocols import check_methods
 from legged_torque.learning.trainer import Trainer
 from legged_torque.utils import distributed
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 
 class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
@@ -32,9 +32,7 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
         check_methods(resolve_callable(train_cfg["algorithm"]["class_name"]))  # not rsl_rl's PPO, for instance
         groups_of_task = list(map(str, env.get_observations().keys()))
         for key, groups in train_cfg["obs_groups"].items():
-            for group in groups or [""]:
-                if group not in groups_of_task:
-                    raise unknown_name(f"observation group in obs_groups.{key}", group, groups_of_task)
+            check_names(f"observation group in obs_groups.{key}", groups or [""], groups_of_task)
         if hasattr(env, "step_graph"):
             env.step_graph.enabled = train_cfg["capture"]
         try:

@@ -22,7 +22,8 @@ class Worlds:
     def __init__(self, task: Any, learner: Any, evaluation: dict[str, Any], others: list[Stateful]) -> None:
         """Take task, learner, the settings ``evaluation``, and other objects whose state belongs to the worlds."""
         self._task, self._others = task, others
-        self._owners = {"worlds": task} | ({"learner": learner} if hasattr(learner, "world_state_dict") else {})
+        owners = {"learner": learner} if hasattr(learner, "world_state_dict") else {}
+        self._owners = owners | {"worlds": task}  # a learner's may not fit, and then all worlds start anew
         self._evaluation = {key: evaluation[key] for key in ("num_envs", "perturbation")}
 
     def gather(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from legged_torque.motors.joints import Joints
 from legged_torque.motors.kernel import Part, TorqueKernel, joint_torque, newest_actions
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 
 class MotorChain:
@@ -33,8 +33,7 @@ class MotorChain:
         known = [name for name, value in vars(settings).items() if isinstance(value, MotorCfg)]
         self.links: dict[str, Motor] = {}
         for name in settings.chain:
-            if name not in known:
-                raise unknown_name("motors.chain", name, known)
+            check_names("motors.chain", [name], known)
             if name in self.links:
                 raise UserError(f"motors.chain has the link '{name}' twice; give the second one a section of its own")
             own = dataclasses.replace(joints, section=f"motors.{name}")

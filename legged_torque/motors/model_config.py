@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 from legged_torque import resource_path
-from legged_torque.motors.config import DelayCfg, MotorCfg, by_joint
+from legged_torque.motors.config import DelayCfg, MotorCfg, PerturbationCfg, by_joint
 from legged_torque.utils.config import Section, section_keys, to_dict, update_from_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.files import read_data
 from legged_torque.utils.limits import DrawLimits, Interval, Limits, Positive
 
@@ -32,9 +32,7 @@ class ModelCfg(MotorCfg):
     def constants(self, dof_names: Sequence[str], path: str) -> dict[str, list[float]]:
         """Return the numbers of all joints by constant; a UserError names what joints or ``draws`` do not have."""
         names = [name for name in section_keys(self) if name not in self._others]
-        for name in self.draws:
-            if name not in names:
-                raise unknown_name(f"{path}.draws", name, names)
+        check_names(f"{path}.draws", self.draws, names)
         return {name: by_joint(f"{path}.{name}", getattr(self, name), dof_names) for name in names}
 
     def whole(self, array: Callable[[Any], Any], dt: float) -> dict[str, Any]:
@@ -83,7 +81,7 @@ class CurveCfg(ModelCfg):
 class DriveCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.drive`: gains that the drive itself closes."""
 
-    _model = "drive"
+    _model, _of_policy = "drive", True
     damping: PerJoint = 0.0  # [N m s/rad] Kd
     stiffness: PerJoint = 0.0  # [N m/rad] Kp, towards the nominal pose
 
@@ -127,7 +125,7 @@ class MuscleCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.muscle`, see :mod:`legged_torque.envs.approaches.sata`."""
 
     _motor_class = "legged_torque.motors.models:MuscleModel"
-    _model = "muscle"
+    _model, _of_policy = "muscle", True
     activation_time: PositivePerJoint = -0.005 / math.log(0.4)  # [s] time constant of the activation
     recovery_time: PositivePerJoint = -0.005 / math.log(0.9)  # [s] of the fatigue
     no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque; of the A1
@@ -224,11 +222,27 @@ class MotorsCfg(Section):
     network = NetworkCfg  # a network from logged data, in torch
     joints = JointsCfg  # no link: inertia and friction of joints
 
+    def of_policy(self) -> list[str]:
+        """Return the links of the chain that belong to the control law, whatever the motors are."""
+        return [name for name in self.chain if getattr(getattr(self, name, None), "_of_policy", False)]
+
     def choose(self, name: str) -> None:
-        """Make one of :attr:`choices` the chain; a UserError for an unknown name."""
-        if name not in self.choices:
-            raise unknown_name("motors", name, self.choices)
-        self.chain = list(self.choices[name])
+        """Make one of :attr:`choices` the chain, where links of the control law stay; a UserError without it."""
+        check_names("motors", [name], self.choices)
+        chosen = self.choices[name]
+        kept = [link for link in self.of_policy() if link not in chosen]
+        place = sum(isinstance(getattr(self, link, None), DelayCfg) for link in chosen)  # delays are the first
+        self.chain = [*chosen[:place], *kept, *chosen[place:]]
+
+    def restore(self, described: dict[str, dict[str, Any]]) -> None:
+        """Take chain and constants of ``policy.yaml``; delays stay. A UserError if a link is none of the task's."""
+        delays = [name for name in self.chain if isinstance(getattr(self, name, None), DelayCfg)]
+        for name, values in described.items():
+            link, path = getattr(self, name, None), f"motors.{name}"
+            if not isinstance(link, ModelCfg) or link._model != values["model"]:
+                raise UserError(f"the policy's task has no {path} of the model '{values['model']}'")
+            update_from_dict(link, {key: value for key, value in values.items() if key != "model"}, path)
+        self.chain = [*delays, *(described or ["ideal"])]
 
     def of_joints(self, dof_names: Sequence[str]) -> dict[str, dict[str, float]]:
         """Return armature [kg m^2], damping [N m s/rad] and frictionloss [N m] by joint, where not those of the file.
@@ -246,4 +260,6 @@ class MotorsCfg(Section):
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""
         links = {name: getattr(self, name) for name in self.chain}
-        return {name: link.describe() for name, link in links.items() if not isinstance(link, DelayCfg)}
+        return {
+            name: link.describe() for name, link in links.items() if not isinstance(link, (DelayCfg, PerturbationCfg))
+        }

@@ -60,6 +60,10 @@ class TorquePerturbation(Motor):
         """Return the weights and the largest perturbation."""
         return read(Perturbation, most=self.cfg.most, offset=self.offset, of_pos=self.of_pos, of_vel=self.of_vel)
 
+    def describe(self) -> dict[str, Any]:
+        """Return nothing: no exported policy has it."""
+        return {}
+
     def random_parameters(self) -> list[RandomParameter]:
         """Return the weights, one draw per joint and world."""
         cfg, joints = self.cfg, range(self.offset.shape[1])

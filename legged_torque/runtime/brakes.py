@@ -75,12 +75,6 @@ def tilt_of(quaternion: np.ndarray) -> float:
     return float(np.arccos(np.clip(1.0 - 2.0 * (x * x + y * y), -1.0, 1.0)))
 
 
-def torques_of(command: MotorCommand, state: RobotState) -> np.ndarray:
-    """Return the torques that drives make of a command in a state [N m]. Shape: (joints,)."""
-    error = command.q - state.joint_positions
-    return command.tau + command.kp * error + command.kd * (command.dq - state.joint_velocities)
-
-
 def limited(
     command: MotorCommand, state: RobotState, before: np.ndarray, largest_change: float, joints: Joints
 ) -> MotorCommand:
@@ -88,14 +82,14 @@ def limited(
 
     The feed-forward torque takes the difference, so that gains stay those of the policy.
     """
-    asked = torques_of(command, state)
+    asked = command.torques(state.joint_positions, state.joint_velocities)
     allowed = np.clip(np.clip(asked, *joints.torque_limits), before - largest_change, before + largest_change)
     return MotorCommand(command.tau + allowed - asked, command.q, command.dq, command.kp, command.kd)
 
 
 def mistake(command: MotorCommand, state: RobotState, joints: Joints) -> str:
     """Return what no policy can mean: torques that are no numbers, or far beyond the limits; empty if there is none."""
-    asked = torques_of(command, state)
+    asked = command.torques(state.joint_positions, state.joint_velocities)
     if not np.isfinite(asked).all():
         return "the policy's torques are not finite"
     excess = np.abs(asked) / np.abs(joints.torque_limits).max(axis=0)

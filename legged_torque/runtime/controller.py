@@ -6,7 +6,7 @@ from enum import Enum
 import numpy as np
 
 from legged_torque.deploy.policy import Policy, State
-from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake, torques_of
+from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake
 from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
@@ -162,7 +162,7 @@ class Controller:
             return self._gentle(self.brakes.damping)
         if self.mode == Mode.POLICY:
             command = self._taking_over(command)
-        before = np.clip(torques_of(self.sent, state), *self.joints.torque_limits)
+        before = np.clip(self.sent.torques(state.joint_positions, state.joint_velocities), *self.joints.torque_limits)
         return limited(command, state, before, self.brakes.torque_rate * self.period, self.joints)
 
     def _fault(self) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from legged_torque.runtime.interface import JOINT_ORDER, MotorCommand, Received, RobotState
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 try:
     from cyclonedds.core import DDSException
@@ -71,8 +71,7 @@ class _Side:
         A UserError if there is no such network interface, or DDS cannot use it or the domain.
         """
         names = [name for _, name in socket.if_nameindex()]
-        if interface not in names:
-            raise unknown_name("network interface", interface, names)
+        check_names("network interface", [interface], names)
         try:
             self._domain = Domain(domain, configuration(interface))
             self._participant = DomainParticipant(domain)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legged_torque.deploy.description import NETWORK_FILE, read, require
+from legged_torque.deploy.description import NETWORK_FILE, beyond, read, require
 from legged_torque.runtime.interface import JOINT_ORDER
 from legged_torque.utils.errors import refuse
 from legged_torque.utils.plain_yaml import Dumper
@@ -20,15 +20,10 @@ UNITREE |= {"joint_position": "joint_pos_rel", "joint_velocity": "joint_vel_rel"
 def _read(folder: Path, known_actions: set[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the description of an export, and what of it neither format has."""
     description, _ = read(folder)
-    observations, actions = description["observations"], description["actions"]["terms"]
-    problems = list(description.get("unsupported", []))
-    problems += [f"the observation {each['name']}" for each in observations["terms"] if each["name"] not in UNITREE]
-    problems += [f"the actions {each['name']}" for each in actions if each["name"] not in known_actions]
-    problems += [f"an interval of {each['name']}" for each in actions if each.get("interval", 1) > 1]
+    problems = [*description.get("unsupported", []), *beyond(description, UNITREE, known_actions)]
     motors = description.get("motors", {}).items()
     problems += [f"the gains of the motors' {name}" for name, motor in motors if motor.get("model") == "drive"]
-    problems += ["a history of observations"] if observations["history_length"] > 1 else []
-    return description, problems + (["a recurrent network"] if "memory" in description["network"] else [])
+    return description, problems
 
 
 def write_deploy_yaml(folder: Path, network: Any) -> None:

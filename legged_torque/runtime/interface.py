@@ -34,6 +34,10 @@ class MotorCommand:
     kp: np.ndarray  # [N m/rad]
     kd: np.ndarray  # [N m s/rad]
 
+    def torques(self, joint_positions: np.ndarray, joint_velocities: np.ndarray) -> np.ndarray:
+        """Return the torques [N m] at joint positions [rad] and velocities [rad/s]. Shapes: (joints,)."""
+        return self.tau + self.kp * (self.q - joint_positions) + self.kd * (self.dq - joint_velocities)
+
 
 @dataclass
 class Received:

@@ -6,7 +6,7 @@ Unitree builds the module for the Go1 (SDK 3.8). For the A1, one has to be built
 import numpy as np
 
 from legged_torque.runtime.interface import JOINT_ORDER, NO_POSITION, NO_VELOCITY, MotorCommand, Received, RobotState
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 KINDS = {"a1": "A1", "go1": "Go1"}  # names of the SDK
 LOW_LEVEL, LOCAL_PORT, ROBOT = 0xFF, 8080, ("192.168.123.10", 8007)
@@ -23,8 +23,7 @@ class LeggedSdkRobot:
 
         A UserError if it is another robot, or the module is not installed.
         """
-        if robot not in KINDS:
-            raise unknown_name("robot of unitree_legged_sdk", robot, KINDS)
+        check_names("robot of unitree_legged_sdk", [robot], KINDS)
         try:
             import robot_interface as sdk
         except ImportError as error:

@@ -1,5 +1,6 @@
 """A policy on a robot: what the control loop does, and counts."""
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -51,12 +52,13 @@ class Session:
             self.log.add(now, missed, received, command)
 
     def close(self) -> None:
-        """Leave the robot in damping, after the loop has ended."""
+        """Leave the robot in damping, after the loop has ended; transport and log are closed even if that fails."""
         self.controller.request(Mode.DAMPING)
         end = time.monotonic() + FAREWELL
-        while time.monotonic() < end:
-            self.tick(self._clock(), missed=False)
-            time.sleep(self.controller.period)
-        self._transport.close()
-        if self.log:
-            self.log.close()
+        with contextlib.ExitStack() as parts:
+            if self.log:
+                parts.callback(self.log.close)
+            parts.callback(self._transport.close)
+            while time.monotonic() < end:
+                self.tick(self._clock(), missed=False)
+                time.sleep(self.controller.period)

@@ -62,9 +62,9 @@ class SimRobot:
     ) -> None:
         """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second.
 
-        Its motors are ideal unless their settings are given, and commands reach them after ``latency`` [s]. If it
-        ``hangs``, it is held by its trunk and touches nothing. A UserError if the file is unreadable, or the robot has
-        other joints than hips, thighs and calves.
+        Its motors are ideal unless their settings are given, of which commands bring what belongs to the control law;
+        they reach them after ``latency`` [s]. If it ``hangs``, it is held by its trunk and touches nothing. A UserError
+        if the file is unreadable, or the robot has other joints than hips, thighs and calves.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -112,7 +112,7 @@ class SimRobot:
         if isinstance(received.newest, MotorCommand):
             self._on_their_way.append((self.data.time + self._latency, received.newest))
             self._age = 0.0
-            asked = self._torques(received.newest)
+            asked = received.newest.torques(self.data.qpos[self._qpos], self.data.qvel[self._dofs])
             low, high = self.limits
             self.excess = max(self.excess, float(np.maximum(asked - high, low - asked).max()))
         zeros = np.zeros(len(self.joint_order))
@@ -124,8 +124,8 @@ class SimRobot:
                 self._command = self._on_their_way.popleft()[1]
             command = self._command if self._age <= WATCHDOG else None
             self.is_damping = command is None
-            asked = self._torques(command or damping)
             pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]
+            asked = (command or damping).torques(pos, vel)
             self._applied = np.where(is_dead, 0.0, self._drives.apply(asked, pos, vel))
             self.data.ctrl[self._motors] = self._applied
             mujoco.mj_step(self.model, self.data)
@@ -138,12 +138,9 @@ class SimRobot:
         timing = {"decimation": self._steps, "physics_frequency": 1.0 / self.model.opt.timestep}
         gains = {"stiffness": zeros, "damping": zeros}
         described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
-        return {**described, "gains": gains, "motors": motors.describe() if motors else {}}
-
-    def _torques(self, command: MotorCommand) -> np.ndarray:
-        """Return what the drives are asked for now [N m]."""
-        error = command.q - self.data.qpos[self._qpos]
-        return command.tau + command.kp * error + command.kd * (command.dq - self.data.qvel[self._dofs])
+        links = motors.describe().items() if motors else ()
+        own = {name: link for name, link in links if motors and name not in motors.of_policy()}
+        return {**described, "gains": gains, "motors": own}
 
     def says(self) -> tuple[RobotState | None, bool]:
         """Return the next message, or none if it is lost or late, and whether it is to be damaged on its way."""

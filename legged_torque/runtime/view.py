@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from legged_torque.runtime.brakes import tilt_of, torques_of
+from legged_torque.runtime.brakes import tilt_of
 from legged_torque.runtime.interface import RobotState
 from legged_torque.runtime.loop import RealTimeLoop
 from legged_torque.runtime.operator import Operator
@@ -86,5 +86,5 @@ class View:
     def _torques(self, state: RobotState) -> tuple[np.ndarray, np.ndarray]:
         """Return what the drives make of the last command [N m], and its shares of the limits. Shapes: (joints,)."""
         controller = self._session.controller
-        torques = torques_of(controller.sent, state)
+        torques = controller.sent.torques(state.joint_positions, state.joint_velocities)
         return torques, np.nan_to_num(np.abs(torques) / np.abs(controller.joints.torque_limits).max(axis=0))

@@ -25,17 +25,9 @@ class HeightMap(Protocol):
     A cell's diagonal runs from sample (i, j) to (i + 1, j + 1), as in MuJoCo's hfield. All worlds have the same map.
     """
 
-    @property
-    def heights(self) -> np.ndarray:
-        """Return the heights [m]: rows along x, columns along y, two or more of each. Shape: (rows, cols)."""
-
-    @property
-    def horizontal_scale(self) -> float:
-        """Return the distance between neighbouring samples [m]."""
-
-    @property
-    def corner(self) -> tuple[float, float]:
-        """Return x and y of sample (0, 0) [m]."""
+    heights: np.ndarray  # [m]; rows along x, columns along y, two or more of each
+    horizontal_scale: float  # distance between neighbouring samples [m]
+    corner: tuple[float, float]  # x and y of sample (0, 0) [m]
 
 
 class Engine(Protocol):

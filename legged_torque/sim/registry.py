@@ -7,7 +7,7 @@ from legged_torque.sim.fused.engine import FusedEngine
 from legged_torque.sim.graph import prepare_device
 from legged_torque.sim.mjwarp import MuJoCoWarpEngine
 from legged_torque.sim.robot_file import actuator_problems
-from legged_torque.utils.errors import refuse, unknown_name
+from legged_torque.utils.errors import check_names, refuse
 
 ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (FusedEngine, MuJoCoWarpEngine)}
 """Values of ``sim.engine``. A user's file may add an engine."""
@@ -15,8 +15,7 @@ ENGINES: dict[str, type[Engine]] = {engine.name: engine for engine in (FusedEngi
 
 def engine_class(name: str) -> type[Engine]:
     """Return the engine of this name; a UserError if there is none."""
-    if name not in ENGINES:
-        raise unknown_name("sim.engine", name, ENGINES)
+    check_names("sim.engine", [name], ENGINES)
     return ENGINES[name]
 
 

@@ -15,7 +15,7 @@ from legged_torque.sim.engine import Engine, check_mask
 from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.set_const import DerivedConstants
 from legged_torque.sim.model import CONTACT_DATA, use_known_options
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 _OF_LEGS = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "body_pos", "body_quat")
 """Fields on which the inverse weights of legs depend, apart from armatures."""
@@ -92,8 +92,7 @@ class WarpEngine(Engine):
 
     def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
         """Return a field; constants of legs are recomputed from now on if other bodies than the trunk may change."""
-        if name not in self._field_names():
-            raise unknown_name(f"field for sim.engine '{self.name}'", name, self._field_names())
+        check_names(f"field for sim.engine '{self.name}'", [name], self._field_names())
         constants = self._constants  # while worlds are alike
         if name not in self.fields:
             self._give_rows(name)

@@ -9,7 +9,7 @@ import numpy as np
 
 from legged_torque.terrain.tiles import START_SIZE, TILES, Grid
 from legged_torque.utils.config import to_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 MAX_SAMPLES = 2**27
 """Of a map, which are half a gigabyte."""
@@ -56,9 +56,7 @@ class Layout:
         if len(self.difficulties) not in (0, self.num_rows):
             given = f"not {len(self.difficulties)}: terrain.num_rows is {self.num_rows}"
             raise UserError(f"terrain.difficulties must be empty or one number for each row, {given}")
-        for name in self.terrain_proportions:
-            if name not in TILES:
-                raise unknown_name("kind in terrain.terrain_proportions", name, TILES)
+        check_names("kind in terrain.terrain_proportions", self.terrain_proportions, TILES)
         total = sum(self.terrain_proportions.values())
         if abs(total - 1.0) > 1e-6:
             raise UserError(f"terrain.terrain_proportions must sum to 1, not {total:g}")

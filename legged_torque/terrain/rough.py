@@ -9,7 +9,7 @@ from torch import Tensor
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 COPIES, BYTES = 3.25, 4
 """Of a map on the device: for rewards and scans, for contacts, and what is greatest near each cell, and near each block
@@ -87,6 +87,5 @@ TERRAINS: dict[str, type[Terrain]] = {"plane": Terrain, "heightfield": RoughGrou
 
 def make_terrain(settings: Any, num_envs: int, device: str) -> Terrain:
     """Return the ground that a section ``terrain`` of settings asks for; a UserError if there is no such ground."""
-    if settings.mesh_type not in TERRAINS:
-        raise unknown_name("terrain.mesh_type", settings.mesh_type, TERRAINS)
+    check_names("terrain.mesh_type", [settings.mesh_type], TERRAINS)
     return TERRAINS[settings.mesh_type](settings, num_envs, device)

@@ -5,7 +5,7 @@ from typing import Any
 
 from legged_torque.terrain.tiles import TILES
 from legged_torque.utils.config import section_keys
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 ALL = "all"
 """Stands for all kinds."""
@@ -15,9 +15,7 @@ COLUMNS = 4
 
 def named_kinds(names: Sequence[str]) -> list[str]:
     """Return the kinds that a user has named, each once; a UserError if there is no such kind."""
-    for name in names:
-        if name not in (ALL, *TILES):
-            raise unknown_name("kind of terrain", str(name), [ALL, *TILES])
+    check_names("kind of terrain", names, [ALL, *TILES])
     return list(TILES) if ALL in names else list(dict.fromkeys(names))
 
 

@@ -2,7 +2,7 @@
 
 import contextlib
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
 """Parts of the messages of CUDA, Warp and torch on the CPU when memory has run out."""
@@ -48,6 +48,13 @@ def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:
     shown = [by_lower_case[name] for name in near] if near and len(allowed) > MANY else allowed
     others = f" and {len(allowed) - len(shown)} others" if len(shown) < len(allowed) else ""
     return UserError(f"unknown {kind} '{given}';{hint} allowed: {', '.join(shown)}{others}")
+
+
+def check_names(kind: str, given: Iterable[str], allowed: Collection[str]) -> None:
+    """Raise :func:`unknown_name` for the first name that is not allowed."""
+    for name in given:
+        if name not in allowed:
+            raise unknown_name(kind, str(name), allowed)
 
 
 def refuse(problems: Sequence[str], what: str = "", advice: str = "") -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.config import section_keys, set_by_path, successor, update_from_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names, unknown_name
 from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
 
@@ -132,9 +132,7 @@ def choose_motors(env_cfg: Any, name: str) -> bool:
         raise UserError(f"cannot read the settings of motors in '{name}': {error}") from None
     if not isinstance(values, dict):
         raise UserError(f"'{name}' must hold the sections {' and '.join(OF_MOTORS)}")
-    for section in values:
-        if section not in OF_MOTORS:
-            raise unknown_name(f"section of '{name}'", str(section), OF_MOTORS)
+    check_names(f"section of '{name}'", values, OF_MOTORS)
     update_from_dict(env_cfg, values)
     return "delay" in values.get("motors", {})
 
@@ -161,8 +159,7 @@ def draw_only(env_cfg: Any, name: str) -> None:
     Motors draw constants of their own where parameters are drawn: those stay as they are, too.
     """
     rand, names = env_cfg.domain_rand, env_cfg.random_parameters()
-    if name not in {*names, *DELAYS, PUSH}:
-        raise unknown_name("random parameter", name, [*names, *DELAYS, PUSH])
+    check_names("random parameter", [name], [*names, *DELAYS, PUSH])
     if name == PUSH:
         rand.push_robots = False  # the sweep pushes
     if name in names and not rand.randomize_parameters:
@@ -174,6 +171,5 @@ def draw_only(env_cfg: Any, name: str) -> None:
 
 def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return one of several named sets of changes."""
-    if name not in choices:
-        raise unknown_name(kind, name, choices)
+    check_names(kind, [name], choices)
     return choices[name]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from legged_torque import resource_path
+from legged_torque.deploy.description import beyond
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import constants
@@ -48,15 +49,8 @@ ACTIONS, MOTORS = ("position_residual", "torque"), ("ideal", "drive", "curve", "
 
 def check(policy: Policy) -> None:
     """Refuse what the page cannot compute, with a UserError that lists it."""
-    description = policy.description
-    observed, acted = description["observations"], description["actions"]["terms"]
-    motors = description.get("motors", {})
-    problems = [f"the observation {term['name']}" for term in observed["terms"] if term["name"] not in OBSERVATIONS]
-    problems += [f"the actions {term['name']}" for term in acted if term["name"] not in ACTIONS]
-    problems += [f"an interval of {term['name']}" for term in acted if term.get("interval", 1) > 1]
+    problems, motors = beyond(policy.description, OBSERVATIONS, ACTIONS), policy.description.get("motors", {})
     problems += [f"the motor {name}" for name, each in motors.items() if each["model"] not in MOTORS]
-    problems += ["a history of observations"] if observed["history_length"] > 1 else []
-    problems += ["a recurrent network"] if "memory" in description["network"] else []
     refuse(problems, "the page cannot compute")
 
 
@@ -91,7 +85,8 @@ def differences(description: dict[str, Any]) -> list[str]:
     """Return what the page leaves out of the training, a line each."""
     latency = description.get("latency", {})
     notes = ["ground: a plane, the policy was trained on rough ground"] if "terrain" in description else []
-    notes += [f"latency of {name}: none" for name, each in latency.items() if each["range"][1] or each["jitter"]]
+    late = [name for name, each in latency.items() if each["range"][1] or each["jitter"] or each.get("loss")]
+    notes += [f"latency of {name}: none" for name in late]
     has_sag = any(each.get("sag") or each.get("voltage", 1.0) != 1.0 for each in description.get("motors", {}).values())
     return notes + (["bus voltage: the nominal one"] if has_sag else [])
 

@@ -11,7 +11,7 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.sim.graph import prepare_device
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 TRUNK = 1  # the trunk's body
 TRUNK_DOFS = 6
@@ -138,8 +138,7 @@ def _check_model(model: mujoco.MjModel, contact_geoms: Sequence[str], names: lis
     if not contact_geoms:
         raise UserError("whole-body control needs at least one geom that may touch the ground")
     for name in contact_geoms:
-        if name not in names:
-            raise unknown_name("contact geom", name, names)
+        check_names("contact geom", [name], names)
         if model.geom(name).type[0] != mujoco.mjtGeom.mjGEOM_SPHERE:
             raise UserError(f"the contact geom '{name}' must be a sphere")
 

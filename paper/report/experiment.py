@@ -123,9 +123,9 @@ class Experiment:
         return self.plan.ranges or " and ".join(sorted(set(map(ranges_of, configs)))) or "unknown"
 
     def last_part(self) -> float:
-        """Return the step at which the last :data:`LAST_SHARE` of the longest training begins, in whole millions."""
+        """Return where the last :data:`LAST_SHARE` of the longest training begins [steps], of long ones in millions."""
         steps = (1.0 - LAST_SHARE) * max((run.total_steps for run in self.runs), default=PAPER_STEPS)
-        return round(steps, -6) or steps
+        return round(steps, -6) if steps >= 1e7 else steps
 
     def columns(self) -> dict[str, tuple[str, str]]:
         """Return the environments of training and evaluation by column of tables, those of Table I first."""

@@ -59,6 +59,21 @@ def test_delay_of_a_file_of_motors(make_task, tmp_path):
     assert found["late", "late.yaml"] == found["ideal", "late.yaml"] == found["late", None]
 
 
+def test_a_file_of_motors_changes_what_it_names(make_task, tmp_path):
+    """sim2sim.py starts from the motors of the export, not from those of its task as it is registered."""
+    changes = {"motors.chain": ["delay", "drive", "ideal", "lag"], "motors.drive.damping": 1.5}
+    changes |= {"motors.lag.time_constant": 0.01, "motors.delay.range": [2, 2]}
+    export_random(make_task, "a1_torque", tmp_path / "own", **changes)
+    (tmp_path / "same.yaml").write_text("motors: {lag: {time_constant: 0.01}}")
+    (tmp_path / "slow.yaml").write_text("motors: {lag: {time_constant: 0.05}}")
+    found = []
+    for words in ([], ["--motors=same.yaml"], ["--motors=slow.yaml"]):
+        words = ["own", "--robots=1", "--steps=20", "--json=out.json", *words]
+        assert run_here("sim2sim.py", *words, root=tmp_path)[0] == 0
+        found.append(json.loads((tmp_path / "out.json").read_text())["metrics"])
+    assert found[0] == found[1] != found[2]
+
+
 def test_jitter_and_loss():
     """Shares of lost packets and times are those of the settings; a late packet does not replace a later one."""
     settings = {"range": [1, 3], "unit": "physics_steps", "jitter": 2, "loss": 0.25}

@@ -98,6 +98,30 @@ def test_resume(tmp_path, capsys, save):
     assert ("The replay starts empty" in capsys.readouterr().out) != save
 
 
+@pytest.mark.parametrize(("rows", "steps", "fits"), [(6, 9, True), (8, 5, True), (8, 9, False), (4, 5, False)])
+def test_a_ring_of_another_size(rows, steps, fits):
+    """What a ring of 6 rows has kept goes on in one of 6, or in one that has not been full; elsewhere it is refused."""
+    task = PointMasses(num_envs=4)
+    rings = [Replay(task.get_observations(), ["policy"], 1, 4 * size, torch.float32, "cpu") for size in (6, rows)]
+    rings[0].allocate()
+    task.keep_final_observations, obs = True, task.get_observations()
+    for _ in range(steps):
+        after, rewards, dones, extras = task.step(actions := 2.0 * torch.rand(4, 1))
+        rest = (dones, extras["time_outs"], after, extras["final_observations"], extras)
+        rings[0].add(Transition(obs, actions, rewards, *rest), actions)
+        obs = after
+    if not fits:
+        with pytest.raises(ValueError, match=f"replay_buffer_size is {4 * rows} steps, and a ring of "):
+            rings[1].load_state_dict(rings[0].state_dict())
+        return
+    rings[1].load_state_dict(rings[0].state_dict())
+    drawn = []
+    for ring in rings:
+        torch.manual_seed(0)
+        drawn.append(ring.sample(50, 2, 0.9))
+    assert torch.equal(drawn[0].rewards, drawn[1].rewards) and drawn[1].weights.all()
+
+
 class NoWaiting(TorchDispatchMode):
     """Refuses operations whose results the host needs."""
 

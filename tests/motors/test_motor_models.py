@@ -265,6 +265,17 @@ def test_choices(task, choice, joint, speed, most):
     assert torques[list(pose).index(joint)] == pytest.approx(most, rel=1e-6, abs=1e-6)
 
 
+def test_the_control_law_keeps_its_drive():
+    """Damping that a policy was trained with stays with other motors; what a policy cannot have is refused."""
+    for choice, rest in (("ideal", ["ideal"]), ("real", ["ideal", "urdf"])):
+        motors = task_registry.get_cfgs("a1_torque_damped", Options(device="cpu", motors=choice))[0].motors
+        assert motors.chain == ["delay", "drive", *rest] and motors.drive.damping == 0.5
+    motors.restore({})
+    assert motors.chain == ["delay", "ideal"]
+    line = error_of(motors.restore, {"choices": {"model": "ideal"}})
+    assert "the policy's task has no motors.choices of the model 'ideal'" in line
+
+
 def test_armature():
     """With its own motors, joints of the G1 have the inertia of their rotors more; of other robots, the file's."""
     inertia = {}

@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from support.control import JOINTS
 from support.exports import export_random
-from support.simulated import RATE, World, robot_of, standing_at_once
+from support.simulated import RATE, Simulated, World, robot_of, standing_at_once
 
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
-from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of, torques_of
+from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of
 from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
+from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.sim_robot import Faults, SimRobot
 from legged_torque.utils.errors import UserError
 
@@ -41,6 +43,30 @@ def test_motors_and_latency():
     np.testing.assert_allclose(seen, np.repeat(expected[:, None], 12, axis=1), atol=1e-5)
 
 
+def test_drives_get_their_gains_by_commands():
+    """A robot with the motors of a policy that damps moves like one without: the commands bring the damping."""
+    motors, at = task_registry.get_cfgs("a1_torque_damped")[0].motors, []
+    motors.drive.stiffness = 5.0
+    for own in (motors, None):
+        robot = SimRobot(resource_path("resources/robots/a1/a1.xml"), [f"{n}_joint" for n in JOINTS], RATE, motors=own)
+        for _ in range(20):
+            robot.step(Received(MotorCommand(*np.zeros((4, 12)), np.full(12, 0.5))))
+        at.append(robot.data.qpos.copy())
+    assert np.array_equal(*at)
+
+
+def test_a_log_is_closed_whatever_fails(policy, tmp_path):
+    """A transport that can no longer send does not cost the log its end."""
+    world = World(policy)
+    log = Log(tmp_path / "log.mcap", world.controller)
+    session = Simulated(world.controller, InProcess(world.robot), log)
+    session.tick(0.0, missed=False)
+    session._transport.send = lambda command: (_ for _ in ()).throw(OSError("the interface is down"))
+    with pytest.raises(OSError, match="is down"):
+        session.close()
+    assert len(list(RecordedLog(tmp_path / "log.mcap").ticks())) == 1
+
+
 def random_state(rng, joints=12):
     """A state of a robot that stands, with joints anywhere near."""
     q, dq, zeros = rng.normal(0.0, 0.5, joints), rng.normal(0.0, 5.0, joints), np.zeros(joints)
@@ -59,9 +85,14 @@ def test_drives_do_what_the_policy_wants(make_task, tmp_path, stiffness, damping
         expected = policy.wanted_torques(actions, state.joint_positions, state.joint_velocities)
         held = stiffness * np.tile([0.0, 0.0, 1.0], 4)
         expected += held * (policy.nominal_pose - state.joint_positions) - damping * state.joint_velocities
+        within = np.clip(expected, *policy.torque_limits)
+        torques = policy.torques(actions, state.joint_positions, state.joint_velocities)
+        np.testing.assert_allclose(torques, within, rtol=1e-4, atol=1e-4)
         tau, q, kp, kd = policy.drive_targets(actions)
         command = MotorCommand(tau, q, np.zeros(12), kp, kd)
-        np.testing.assert_allclose(torques_of(command, state), expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(
+            command.torques(state.joint_positions, state.joint_velocities), expected, rtol=1e-4, atol=1e-4
+        )
 
 
 def test_torques_stay_within_limits_and_change_slowly():
@@ -73,11 +104,12 @@ def test_torques_stay_within_limits_and_change_slowly():
         for _ in range(20):
             state, before = random_state(rng), rng.uniform(*limits)
             command = MotorCommand(*(scale * rng.normal(size=12) for _ in range(5)))
-            result = torques_of(limited(command, state, before, 4.0, joints), state)
+            at = (state.joint_positions, state.joint_velocities)
+            result = limited(command, state, before, 4.0, joints).torques(*at)
             tolerance = 1e-9 * scale**2 * 100
             assert (result >= limits[0] - tolerance).all() and (result <= limits[1] + tolerance).all()
             assert (np.abs(result - before) <= 4.0 + tolerance).all()
-            asked = torques_of(command, state)
+            asked = command.torques(*at)
             is_allowed = (np.abs(asked - before) < 4.0) & (asked > limits[0]) & (asked < limits[1])
             np.testing.assert_allclose(result[is_allowed], asked[is_allowed], rtol=1e-9)
 

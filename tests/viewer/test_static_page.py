@@ -23,9 +23,16 @@ def test_refused():
     changed["actions"]["terms"][0] |= {"interval": 4}
     changed["motors"] |= {"drive": {"model": "drive"}, "heat": {"model": "thermal"}}
     with pytest.raises(
-        UserError, match=r"the observation height.*interval of position_residual; the motor heat.*history"
+        UserError, match=r"the observation height.*interval of position_residual; .*history.*; the motor heat"
     ):
         static_page.check(SimpleNamespace(description=changed))
+
+
+def test_what_the_page_leaves_out():
+    """Latency of any kind is named, also that of packets that are lost."""
+    exact = {"range": [0, 0], "unit": "physics_steps", "jitter": 0, "loss": 0.0}
+    description = {"latency": {"actions": exact, "measurements": exact | {"loss": 0.1}}}
+    assert static_page.differences(description) == ["latency of measurements: none"]
 
 
 def test_files_of_the_robot(tmp_path):

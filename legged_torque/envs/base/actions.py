@@ -46,10 +46,6 @@ class ControlParameters:
         self.action_scale, self.torque_scale = zeros[:, :1] + control.action_scale, zeros[:, :1] + control.torque_scale
         self.torque_per_position = control.torque_scale / control.action_scale
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Return what differs between worlds, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and value.dim() == 2}
-
 
 @dataclass
 class ActionTerm:

@@ -14,7 +14,7 @@ from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.errors import UserError, collect_errors, refuse, unknown_name
+from legged_torque.utils.errors import UserError, check_names, collect_errors, refuse
 from legged_torque.utils.mjcf import (
     drawing_notes,
     exclude_self_collisions,
@@ -122,9 +122,7 @@ def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[flo
     A UserError if a joint is missing or unknown, or the order differs.
     """
     key = "init_state.default_joint_angles"
-    for name in angles:
-        if name not in dof_names:
-            raise unknown_name(f"joint in {key}", name, dof_names)
+    check_names(f"joint in {key}", angles, dof_names)
     for name in dof_names:
         if name not in angles:
             raise UserError(f"{key} lacks the joint '{name}'")

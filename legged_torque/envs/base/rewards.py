@@ -8,7 +8,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.utils.config import section_keys, to_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 
 class Rewards:
@@ -31,9 +31,7 @@ class Rewards:
         """
         scales = {name: scale for name, scale in to_dict(settings.scales).items() if scale != 0.0}
         curricula = {name: getattr(settings.curriculum, name) for name in section_keys(settings.curriculum)}
-        for name in [*scales, *curricula]:
-            if name not in functions:
-                raise unknown_name("reward term", name, functions)
+        check_names("reward term", [*scales, *curricula], functions)
         self.names = list(scales)
         self.terms, self.episode_sums = (torch.zeros(len(self.names), num_envs, device=device) for _ in range(2))
         self._functions, self._rows = [functions[name] for name in self.names], self.terms.unbind()

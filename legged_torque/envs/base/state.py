@@ -10,7 +10,7 @@ from legged_torque.sim.engine import Engine
 from legged_torque.sim.kinematics import Fields, Points
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import Buffers
-from legged_torque.utils.errors import unknown_name
+from legged_torque.utils.errors import check_names
 from legged_torque.utils.math import quat_rotate_inverse
 
 _TRUNK = 1  # its body
@@ -147,8 +147,7 @@ class RobotState(Buffers):
 
     def _body(self, name: str) -> Points:
         """Return the origin of a body; a UserError if there is none of this name."""
-        if name not in self._bodies:
-            raise unknown_name("body of the robot", name, self._bodies)
+        check_names("body of the robot", [name], self._bodies)
         return self._bodies[name]
 
     def _foot_offsets(self) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
 from legged_torque.utils.config import to_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 
 class Terminations:
@@ -28,8 +28,7 @@ class Terminations:
         known = [name.removeprefix("_termination_") for name in dir(self) if name.startswith("_termination_")]
         self.terminations: dict[str, Callable[[], Tensor]] = {}
         for name, limit in to_dict(self.cfg.terminations).items():
-            if name not in known:
-                raise unknown_name("termination", name, known)
+            check_names("termination", [name], known)
             if limit:
                 self.terminations[name] = getattr(self, f"_termination_{name}")
 

@@ -14,7 +14,7 @@ from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.flashsac_config import FLASHSAC
 from legged_torque.envs.base.linear_change import scale_changes
 from legged_torque.utils.config import BaseConfig, flat, section_keys, to_dict, update_from_dict
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names, unknown_name
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -64,8 +64,7 @@ class TrainingCfg(BaseConfig):
 
     def use_preset(self, name: str, env_cfg: BaseConfig) -> None:
         """Apply one of the presets to these settings and those of the task; a UserError if there is none."""
-        if name not in self.presets():
-            raise unknown_name("preset", name, self.presets())
+        check_names("preset", [name], self.presets())
         changes = dict(self.presets()[name])
         scale_changes(env_cfg, changes.pop("linear_changes", 1.0))
         for section, values in changes.items():

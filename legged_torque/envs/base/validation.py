@@ -2,7 +2,7 @@
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
@@ -20,9 +20,7 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     if cfg.terrain.mesh_type == "heightfield":
         _check_map(cfg)
     parameters = cfg.random_parameters()
-    for name in cfg.domain_rand.keep_fixed:
-        if name not in parameters:
-            raise unknown_name("parameter in domain_rand.keep_fixed", name, parameters)
+    check_names("parameter in domain_rand.keep_fixed", cfg.domain_rand.keep_fixed, parameters)
     delay = cfg.motors.delay
     if (delay.range[1] or delay.jitter) and delay.unit != "control_steps" and not cfg.control.refresh_torques:
         raise UserError(

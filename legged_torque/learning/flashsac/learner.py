@@ -319,12 +319,12 @@ class FlashSAC:
         return state | ({"replay": self.replay.state_dict()} if self.settings["save_replay"] else {})
 
     def load_world_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`world_state_dict`; a line says so if it has no replay."""
-        self.returns.copy_(state["returns"])
-        for name, tensor in self.noise.tensors().items():
-            tensor.copy_(state["noise"][name])
+        """Continue from a :meth:`world_state_dict`, all or nothing; a line says so if it has no replay."""
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])
         else:
             least = self.settings["buffer_min_length"]
             print(f"The replay starts empty, flashsac.save_replay was off: learning goes on after {least} steps.")
+        self.returns.copy_(state["returns"])
+        for name, tensor in self.noise.tensors().items():
+            tensor.copy_(state["noise"][name])

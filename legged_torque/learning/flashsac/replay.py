@@ -138,7 +138,11 @@ class Replay:
         return {**held, **last, "_timed_out": self._timed_out, "count": self.count}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue with a :meth:`state_dict` of as many worlds and rows."""
+        """Continue with a :meth:`state_dict` of as many worlds; a ValueError if its rows are not those of this ring."""
+        rows = len(state["_rewards"])
+        if rows != min(int(state["count"]), self.rows):
+            had, room = rows * self.num_envs, self.rows * self.num_envs
+            raise ValueError(f"flashsac.replay_buffer_size is {room} steps, and a ring of {had} was kept")
         self.allocate()
         for name, kept in self._steps.items():
             kept[: len(state[name])] = state[name].to(kept.device)

@@ -75,12 +75,15 @@ export class Robot {
     if (!this.data.qpos.every(Number.isFinite)) return true;
     const { ncon } = this.data;
     if (!ncon) return false;
-    const contacts = this.data.contact;
-    for (let i = 0; i < ncon; i++) {
+    const contacts = this.data.contact; // copies, as is each of them, which stay until they are deleted
+    let touches = false;
+    for (let i = 0; i < ncon && !touches; i++) {
       const contact = contacts.get(i);
-      if (this.ending.has(contact.geom1) || this.ending.has(contact.geom2)) return true;
+      touches = this.ending.has(contact.geom1) || this.ending.has(contact.geom2);
+      contact.delete();
     }
-    return false;
+    contacts.delete();
+    return touches;
   }
 }
 
