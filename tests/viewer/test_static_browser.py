@@ -97,5 +97,7 @@ def test_page(browser, served):
     for width in (1920, 1280, 390):
         with screen(browser, width, 800, 0.1):  # few pixels are drawn
             assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    begin, end = browser.execute_script(SCRIPTS["memory"])
+    assert begin == end
     assert [browser.execute_script(SCRIPTS["adapt"], time) for time in (1 / 30, 1 / 60)] == [0, 1]
     assert not complaints(browser)

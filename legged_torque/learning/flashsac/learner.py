@@ -100,6 +100,7 @@ class FlashSAC:
         self.graphs = {learns: CudaGraph(step, device) for learns, step in steps.items()}
         self._losses: dict[str, Callable] = {"actor": self.actor_loss, "critic": self.critic_loss}
         self._bound: Callable = bound_weights
+        self._draw: Callable = self._sample
         self.uses_bfloat16 = False
 
     @classmethod
@@ -125,8 +126,9 @@ class FlashSAC:
         return alg
 
     def compile(self) -> None:
-        """Let losses and what bounds weights run as few kernels, where they can be compiled."""
+        """Let samples, losses and what bounds weights run as few kernels, where they can be compiled."""
         device = self.replay.device
+        self._draw = compiled(self._sample, device)
         self._losses = {name: compiled(loss, device, learns=True) for name, loss in self._losses.items()}
         self._bound = compiled(self._bound, device, learns=True)
 
@@ -203,7 +205,7 @@ class FlashSAC:
 
     def take_gradient_step(self, actor_learns: bool) -> None:
         """Draw samples; let the actor learn from them, if it does, then the critic; let the target follow."""
-        batch = self._sample()
+        batch = self._draw()
         if actor_learns:
             self._descend("actor", batch, self.actor)
         self._descend("critic", batch, self.critic)
