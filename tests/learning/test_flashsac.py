@@ -221,10 +221,10 @@ def test_settings_of_flashsac_are_refused_with_ppo():
 @pytest.mark.parametrize("copies", [(), (2,)])
 def test_aligned_products(copies):
     """Those of a GPU are those of torch, with their gradients, for sizes that are no multiples of eight."""
-    layer, inputs = UnitLinear(45, 101, copies), torch.randn(*copies, 6, 45, requires_grad=True)
+    layer, inputs = UnitLinear(45, 101, copies), torch.randn(*copies, 45, 6, requires_grad=True)
     found = []
     for outputs in (layer(inputs), layer.aligned_product(inputs)):
-        assert outputs.shape == (*copies, 6, 101)
+        assert outputs.shape == (*copies, 101, 6)
         found.append([outputs, *torch.autograd.grad(outputs.pow(3).sum(), (inputs, layer.weight))])
     torch.testing.assert_close(*found)
 
@@ -233,18 +233,20 @@ def test_aligned_products(copies):
 def test_batch_normalization(copies):
     """Outputs, gradients and running statistics are torch's, of each copy alone, in learning and in use."""
     torch.manual_seed(0)
-    ours, inputs = UnitBatchNorm(5, copies), (3.0 * torch.randn(*copies, 40, 5) + 1.0).requires_grad_()
+    ours, inputs = UnitBatchNorm(5, copies), (3.0 * torch.randn(*copies, 5, 40) + 1.0).requires_grad_()
     for parameter in (ours.scale, ours.shift):
         torch.nn.init.uniform_(parameter, 0.5, 1.5)
     index, theirs = (1,) * len(copies), torch.nn.BatchNorm1d(5, momentum=0.01)
     theirs.load_state_dict({"weight": ours.scale[index], "bias": ours.shift[index]}, strict=False)
-    twin = inputs[index].detach().requires_grad_()
+    twin = inputs[index].detach().T.requires_grad_()
     for learning in (True, False):
         outputs, expected = ours(inputs, learning), theirs.train(learning)(twin)
         pairs = (outputs, (inputs, ours.scale, ours.shift)), (expected, (twin, theirs.weight, theirs.bias))
         grads = [torch.autograd.grad(y[index if y is outputs else ()].pow(3).sum(), x) for y, x in pairs]
-        torch.testing.assert_close(outputs[index], expected)
-        torch.testing.assert_close([grad[index] for grad in grads[0]], list(grads[1]), atol=1e-3, rtol=1e-4)
+        torch.testing.assert_close(outputs[index].T, expected)
+        torch.testing.assert_close(
+            [grads[0][0][index].T, *(grad[index] for grad in grads[0][1:])], list(grads[1]), atol=1e-3, rtol=1e-4
+        )
     torch.testing.assert_close(ours.mean[index], theirs.running_mean)
     torch.testing.assert_close(ours.var[index], theirs.running_var)
 
@@ -263,8 +265,8 @@ def test_norms_are_bounded():
         else:
             norms = torch.cat(list(module.parameters()), dim=-1).norm(dim=-1)
             torch.testing.assert_close(norms, torch.full((2,), math.sqrt(module.scale.shape[-1])))
-    features = trunk((1e3 * torch.randn(30, 7)).expand(2, 30, 7), True) / trunk.norm.scale.unsqueeze(1)
-    torch.testing.assert_close(features.norm(dim=-1), torch.full((2, 30), 4.0), atol=1e-3, rtol=1e-3)
+    features = trunk((1e3 * torch.randn(30, 7)).expand(2, 30, 7), True) / trunk.norm.scale.unsqueeze(-1)
+    torch.testing.assert_close(features.norm(dim=1), torch.full((2, 30), 4.0), atol=1e-3, rtol=1e-3)
 
 
 def test_log_density_of_squashed_actions():

@@ -98,9 +98,8 @@ class FlashSAC:
         self.num_updates = 0
         steps = {learns: functools.partial(self.take_gradient_step, learns) for learns in (True, False)}
         self.graphs = {learns: CudaGraph(step, device) for learns, step in steps.items()}
-        self._losses: dict[str, Callable] = {"actor": self.actor_loss, "critic": self.critic_loss}
-        self._bound: Callable = bound_weights
-        self._draw: Callable = self._sample
+        self._run: dict[str, Callable] = {"act": self._random_actions, "keep": self._remember, "draw": self._sample}
+        self._run |= {"actor": self.actor_loss, "critic": self.critic_loss, "bound": bound_weights}
         self.uses_bfloat16 = False
 
     @classmethod
@@ -126,11 +125,9 @@ class FlashSAC:
         return alg
 
     def compile(self) -> None:
-        """Let samples, losses and what bounds weights run as few kernels, where they can be compiled."""
-        device = self.replay.device
-        self._draw = compiled(self._sample, device)
-        self._losses = {name: compiled(loss, device, learns=True) for name, loss in self._losses.items()}
-        self._bound = compiled(self._bound, device, learns=True)
+        """Let its parts run as few kernels, where they can be compiled."""
+        device, learned = self.replay.device, ("actor", "critic", "bound")
+        self._run = {name: compiled(part, device, learns=name in learned) for name, part in self._run.items()}
 
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
@@ -147,6 +144,10 @@ class FlashSAC:
 
     def act(self, obs: TensorDict) -> Tensor:
         """Return random actions in the task's units. Shape: (num_envs, num_actions)."""
+        return self._run["act"](obs)
+
+    def _random_actions(self, obs: TensorDict) -> Tensor:
+        """Return random actions for :meth:`act`."""
         mean, std = self.actor.distribution(obs, learning=False)
         uniform = 2.0 * torch.rand_like(mean) - 1.0
         actions = torch.tanh(mean + std * self.noise.next())
@@ -155,6 +156,10 @@ class FlashSAC:
     def observe(self, transition: Transition) -> None:
         """Keep a step, and let the scale of rewards follow it."""
         self.allocate()  # of a training that keeps no run
+        self._run["keep"](transition)
+
+    def _remember(self, transition: Transition) -> None:
+        """Keep a step for :meth:`observe`."""
         self.reward_scale.follow(self.returns, transition.rewards, transition.dones)
         self.replay.add(transition, transition.actions / self.actor.action_bound)
 
@@ -205,7 +210,7 @@ class FlashSAC:
 
     def take_gradient_step(self, actor_learns: bool) -> None:
         """Draw samples; let the actor learn from them, if it does, then the critic; let the target follow."""
-        batch = self._draw()
+        batch = self._run["draw"]()
         if actor_learns:
             self._descend("actor", batch, self.actor)
         self._descend("critic", batch, self.critic)
@@ -262,7 +267,7 @@ class FlashSAC:
     def _descend(self, name: str, batch: Batch, network: nn.Module) -> None:
         """Take a step of the optimizer ``name``, bound the weights of its network, and sum up the loss's numbers."""
         with torch.autocast("cuda", torch.bfloat16, enabled=self.uses_bfloat16):
-            loss, numbers = self._losses[name](batch)
+            loss, numbers = self._run[name](batch)
         optimizer = self.optimizers[name]
         parameters = optimizer.param_groups[0]["params"]
         optimizer.zero_grad()
@@ -270,7 +275,7 @@ class FlashSAC:
         norm = nn.utils.get_total_norm([parameter.grad for parameter in parameters])
         self._skip.copy_(~torch.isfinite(norm))
         optimizer.step()
-        self._bound(network)
+        self._run["bound"](network)
         made = 1.0 - self._skip
         all_numbers = torch.cat([numbers, torch.stack([norm, made])])
         self._sums[name] += torch.where(self._skip.bool(), 0.0, all_numbers)

@@ -4,7 +4,8 @@ Weights that act on one feature have the norm 1 after each gradient step, scales
 the root of their number. Features pass a batch normalization, whose running means also normalize observations, and an
 RMS normalization before the last layer. Gradients are bounded by these and by the critic's cross-entropy.
 
-``copies`` are leading dimensions of all weights: () for a single network, (2,) for two critics in one.
+``copies`` are leading dimensions of all weights: () for a single network, (2,) for two critics in one. Inside, samples
+are columns: a normalization then runs along memory, and the gradients of weights come out as weights are.
 """
 
 import copy
@@ -32,8 +33,8 @@ class UnitLinear(nn.Module):
             nn.init.orthogonal_(weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return float32 outputs, whatever autocast multiplies. Shape: (..., samples, num_outputs)."""
-        product = self.aligned_product(x) if x.is_cuda else x @ self.weight.transpose(-1, -2)
+        """Return float32 outputs, whatever autocast multiplies. Shape: (..., num_outputs, samples)."""
+        product = self.aligned_product(x) if x.is_cuda else self.weight @ x
         return product.float()
 
     def aligned_product(self, x: Tensor) -> Tensor:
@@ -41,7 +42,7 @@ class UnitLinear(nn.Module):
         num_outputs, num_inputs = self.weight.shape[-2], self.weight.shape[-1]
         behind, below = -num_inputs % 8, -num_outputs % 8
         weight = nn.functional.pad(self.weight, [0, behind, 0, below])
-        return (nn.functional.pad(x, [0, behind]) @ weight.transpose(-1, -2))[..., :num_outputs]
+        return (weight @ nn.functional.pad(x, [0, 0, 0, behind]))[..., :num_outputs, :]
 
     @torch.jit.unused
     def bound(self) -> None:
@@ -63,12 +64,13 @@ class UnitBatchNorm(nn.Module):
         self.register_buffer("var", torch.ones(*copies, size))
 
     def forward(self, x: Tensor, learning: bool) -> Tensor:
-        """Normalize by the running statistics, or if it is ``learning`` by those of the batch, which they follow."""
-        has_copies = x.dim() == 3
-        behind = x.transpose(0, 1) if has_copies else x  # features of all copies behind each other
+        """Normalize by the running statistics, or if it is ``learning`` by those of the batch, which they follow.
+
+        Shapes: (..., size, samples).
+        """
         mean, var, scale, shift = self.mean.flatten(), self.var.flatten(), self.scale.flatten(), self.shift.flatten()
-        normalized = nn.functional.batch_norm(behind.flatten(1), mean, var, scale, shift, learning, momentum=0.01)
-        return normalized.view(behind.shape).transpose(0, 1) if has_copies else normalized
+        rows = x.flatten(0, -2).unsqueeze(0)  # features of all copies behind each other
+        return nn.functional.batch_norm(rows, mean, var, scale, shift, learning, momentum=0.01).view(x.shape)
 
     @torch.jit.unused
     def bound(self) -> None:
@@ -88,8 +90,8 @@ class UnitRMSNorm(nn.Module):
         self.scale = nn.Parameter(torch.ones(*copies, size))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the normalized samples. Shape: (..., samples, size)."""
-        return x * torch.rsqrt(x.square().mean(dim=-1, keepdim=True) + 1e-6) * self.scale.unsqueeze(-2)
+        """Return the normalized samples. Shape: (..., size, samples)."""
+        return x * torch.rsqrt(x.square().mean(dim=-2, keepdim=True) + 1e-6) * self.scale.unsqueeze(-1)
 
     @torch.jit.unused
     def bound(self) -> None:
@@ -125,8 +127,11 @@ class Trunk(nn.Module):
         self.norm = UnitRMSNorm(hidden_dim, copies)
 
     def forward(self, x: Tensor, learning: bool) -> Tensor:
-        """Return features. Shape: (*copies, samples, hidden_dim); ``learning`` as of :class:`UnitBatchNorm`."""
-        x = self.input_layer(self.input_norm(x, learning))
+        """Return features of inputs, ``learning`` as of :class:`UnitBatchNorm`.
+
+        Shapes: (*copies, samples, num_inputs) to (*copies, hidden_dim, samples).
+        """
+        x = self.input_layer(self.input_norm(x.transpose(-1, -2), learning))
         for block in self.blocks:
             x = block(x, learning)
         return self.norm(x)
@@ -170,7 +175,7 @@ class FlashSACActor(nn.Module):
     def distribution(self, obs: TensorDict, learning: bool) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation before tanh. Shapes: (samples, num_actions)."""
         inputs = torch.cat([obs[group] for group in self.obs_groups], dim=-1)
-        mean, raw = (self.head(self.trunk(inputs, learning)) + self.head_shift).chunk(2, dim=-1)
+        mean, raw = (self.head(self.trunk(inputs, learning)).transpose(-1, -2) + self.head_shift).chunk(2, dim=-1)
         low, high = LOG_STD
         return mean, torch.exp(low + (high - low) * 0.5 * (1.0 + torch.tanh(raw)))
 
@@ -201,7 +206,7 @@ class MeanActions(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Return mean actions in the task's units. Shape: (samples, num_actions)."""
-        mean = nn.functional.linear(self.trunk(x, False), self.weight, self.shift)
+        mean = nn.functional.linear(self.trunk(x, False).transpose(-1, -2), self.weight, self.shift)
         return self.action_bound * torch.tanh(mean)
 
     @torch.jit.export
@@ -244,7 +249,8 @@ class FlashSACCritic(nn.Module):
         """
         inputs = torch.cat([*(obs[group] for group in self.obs_groups), actions], dim=-1)
         features = self.trunk(inputs.expand(2, *inputs.shape), learning)
-        log_probs = torch.log_softmax(self.head(features) + self.head_shift.unsqueeze(-2), dim=-1)
+        values = self.head(features).transpose(-1, -2) + self.head_shift.unsqueeze(-2)
+        log_probs = torch.log_softmax(values, dim=-1)
         return log_probs, (log_probs.exp() * self.values).sum(dim=-1)
 
 
