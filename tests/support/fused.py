@@ -86,7 +86,21 @@ def put(sim, states):
             getattr(sim, field).copy_(torch.tensor(values))
 
 
-SELF_SCRATCH = {"poses", "found", "residual", "pushing", "change", "geoms", "normal", "jacobian", "joints", "matrix"}
+SELF_SCRATCH = {
+    "lin_vel",
+    "ang_vel",
+    "x_axis",
+    "z_axis",
+    "found",
+    "residual",
+    "pushing",
+    "change",
+    "geoms",
+    "normal",
+    "jacobian",
+    "joints",
+    "matrix",
+}
 
 
 def spoil(sim):

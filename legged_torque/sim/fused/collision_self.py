@@ -20,9 +20,9 @@ from legged_torque.sim.fused.collision_primitive import (
     sphere_sphere,
 )
 from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
-from legged_torque.sim.fused.math import group_sum, quat_to_matrix, sum_before, sync_group
+from legged_torque.sim.fused.math import group_sum, lowest_bit, quat_to_matrix, sum_before, sync_group
 from legged_torque.sim.fused.model import Model, of_world
-from legged_torque.sim.fused.smooth import Pose
+from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
@@ -30,7 +30,9 @@ from legged_torque.utils.mjcf import self_pairs
 MAX_SELF_CONTACTS = wp.constant(24)
 """Most contacts of a world between parts of its robot. Further ones are dropped and reported in ``overflow``."""
 AT_ONCE = wp.constant(8)
-"""Pairs that a thread looks at before all threads of its world say what they have found."""
+"""Pairs whose spheres a thread reads at once."""
+WORD = wp.constant(32)
+"""Pairs that a thread looks at before all threads of its world say what they have found: bits of a number."""
 SPHERE = wp.constant(2)
 """MuJoCo's mjGEOM_SPHERE."""
 OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
@@ -46,12 +48,16 @@ class SelfContacts:
     pair_friction: wp.array2d(dtype=vec5)  # of each <pair>, fields of MuJoCo Warp's model
     pair_solref: wp.array2d(dtype=wp.vec2)
     pair_solimp: wp.array2d(dtype=vec5)
-    geom: wp.array(dtype=wp.int32)  # all geoms of pairs
+    geom: wp.array(dtype=wp.int32)  # all geoms of pairs, branch by branch; the trunk's are in the first one
+    geom_start: wp.array(dtype=wp.int32)  # of each branch, and the end
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
-    # Scratch:
-    poses: wp.array3d(dtype=Pose)  # (world, branch, depth)
-    sphere: wp.array2d(dtype=vec4)  # (geom, world): centre and radius; worlds last, so that threads read neighbours
+    # Scratch; worlds are last where threads read and write neighbours:
+    lin_vel: wp.array3d(dtype=wp.vec3)  # (branch, depth, world): of the body, at the trunk's origin
+    ang_vel: wp.array3d(dtype=wp.vec3)
+    sphere: wp.array2d(dtype=vec4)  # (geom, world): position from there, and the radius of a sphere around the geom
+    x_axis: wp.array2d(dtype=vec4)  # of the geom, with a 0 behind, so that it is read at once
+    z_axis: wp.array2d(dtype=vec4)
     near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
@@ -64,10 +70,15 @@ class SelfContacts:
     matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
     # Out:
     overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
-    # A thread's own:
-    first: wp.int32  # contacts of its world, from the first one on
+
+
+@wp.struct
+class Touching:
+    """The contacts of a thread's world; not in the struct of arrays, of which a thread that writes in it has a copy."""
+
+    first: wp.int32
     end: wp.int32
-    coupled: wp.bool  # whether a contact between two branches pushes
+    coupled: wp.bool  # whether one between two branches pushes
 
 
 def ordered_pairs(model: mujoco.MjModel) -> np.ndarray:
@@ -94,10 +105,13 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     airborne = np.setdiff1d(pairs, on_ground)
     out.airborne = wp.array(model.sensor_adr[np.isin(model.sensor_refid, airborne)], dtype=wp.int32)
     out.geom_place = wp.array(tree.geom_places, dtype=wp.vec2i)
-    out.geom = wp.array(np.unique(pairs), dtype=wp.int32)
-    out.sphere = wp.empty((model.ngeom, worlds), dtype=vec4)
+    geoms = sorted(np.unique(pairs).tolist(), key=lambda geom: tree.geom_places[geom])
+    owners = [tree.geom_places[geom][0] for geom in geoms]
+    out.geom = wp.array(geoms, dtype=wp.int32)
+    out.geom_start = wp.array(np.searchsorted(owners, range(branches + 1)), dtype=wp.int32)
+    out.lin_vel, out.ang_vel = (wp.empty((branches, depth + 1, worlds), dtype=wp.vec3) for _ in range(2))
+    out.sphere, out.x_axis, out.z_axis = (wp.empty((model.ngeom, worlds), dtype=vec4) for _ in range(3))
     out.near = wp.empty((len(pairs), worlds), dtype=wp.int32)
-    out.poses = wp.empty((worlds, branches, depth + 1), dtype=Pose)
     room = worlds * MAX_SELF_CONTACTS
     out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
     out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
@@ -109,24 +123,12 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
 
 
 @wp.func
-def pose_of(selves: SelfContacts, world: int, geom: int) -> Pose:
-    """Return the pose of a geom's body."""
-    place = selves.geom_place[geom]
-    return selves.poses[world, place[0], place[1]]
-
-
-@wp.func
-def middle_of(model: Model, selves: SelfContacts, world: int, geom: int) -> wp.vec3:
-    """Return the position of a geom from the trunk's origin."""
-    pose = pose_of(selves, world, geom)
-    return pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
-
-
-@wp.func
 def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape:
     """Return a geom in the world."""
-    rot = pose_of(selves, world, geom).rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
-    return Shape(middle_of(model, selves, world, geom), rot, of_world(model.geom_size, world, geom))
+    sphere, x, z = selves.sphere[geom, world], selves.x_axis[geom, world], selves.z_axis[geom, world]
+    x_axis, z_axis = wp.vec3(x[0], x[1], x[2]), wp.vec3(z[0], z[1], z[2])
+    rot = wp.matrix_from_cols(x_axis, wp.cross(z_axis, x_axis), z_axis)
+    return Shape(wp.vec3(sphere[0], sphere[1], sphere[2]), rot, of_world(model.geom_size, world, geom))
 
 
 @wp.func
@@ -142,12 +144,19 @@ def reach_of(model: Model, world: int, geom: int) -> float:
 
 
 @wp.func
-def write_spheres(model: Model, selves: SelfContacts, world: int, thread: int, threads: int):
-    """Write a sphere around each geom, from the trunk's origin; the threads take turns."""
-    for i in range(thread, selves.geom.shape[0], threads):
+def write_parts(model: Model, selves: SelfContacts, world: int, b: int, poses: Poses):
+    """Write where the geoms of a branch are, and how its bodies move, for the other threads of its world."""
+    for d in range(poses.shape[0]):
+        selves.lin_vel[b, d, world] = poses[d].lin_vel
+        selves.ang_vel[b, d, world] = poses[d].ang_vel
+    for i in range(selves.geom_start[b], selves.geom_start[b + 1]):
         geom = selves.geom[i]
-        middle = middle_of(model, selves, world, geom)
-        selves.sphere[geom, world] = vec4(middle[0], middle[1], middle[2], reach_of(model, world, geom))
+        pose = poses[selves.geom_place[geom][1]]
+        pos = pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
+        rot = pose.rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
+        selves.sphere[geom, world] = vec4(pos[0], pos[1], pos[2], reach_of(model, world, geom))
+        selves.x_axis[geom, world] = vec4(rot[0, 0], rot[1, 0], rot[2, 0], 0.0)
+        selves.z_axis[geom, world] = vec4(rot[0, 2], rot[1, 2], rot[2, 2], 0.0)
 
 
 @wp.func
@@ -176,29 +185,37 @@ def is_beside(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -
 
 @wp.func
 def write_near(model: Model, selves: SelfContacts, world: int, thread: int, threads: int) -> int:
-    """Write the pairs of a world that may touch, in order, and return their number.
+    """Write the pairs of a world that may touch, those of each thread in order, and return their number.
 
-    Few are near, and contacts take the most code: threads that search apart would wait for each other at each of them.
+    Few are near. Threads collect these before they look closer, or they would wait for each other at every pair.
     """
     end = int(0)
-    for start in range(0, selves.pair.shape[0], AT_ONCE * threads):
-        near = int(0)  # a bit for each pair of this thread
-        for i in range(AT_ONCE):
-            pair = start + i * threads + thread
-            if pair < selves.pair.shape[0]:
-                near += wp.where(are_near(selves, world, selves.pair[pair]), 1 << i, 0)
-        if group_sum(float(near), threads) > 0.0:
-            i = int(0)
-            while i < AT_ONCE:  # not unrolled
-                pair = start + i * threads + thread
-                may_touch = float(0.0)
-                if (near >> i) % 2 == 1:
-                    may_touch = wp.where(is_beside(model, selves, world, selves.pair[pair]), 0.0, 1.0)
-                place = end + int(sum_before(may_touch, thread, threads))
-                if may_touch > 0.0:
-                    selves.near[place, world] = pair
-                end += int(group_sum(may_touch, threads))
-                i += 1
+    for word in range(0, selves.pair.shape[0], WORD * threads):
+        start = word + thread
+        near, may_touch = int(0), int(0)  # a bit for each pair of this thread
+        k = int(0)
+        while k < WORD:
+            for i in range(AT_ONCE):
+                pair = start + (k + i) * threads
+                if pair < selves.pair.shape[0]:
+                    near |= wp.where(are_near(selves, world, selves.pair[pair]), 1 << (k + i), 0)
+            k += AT_ONCE
+        number = float(0.0)
+        while near != 0:
+            bit = lowest_bit(near)
+            near ^= 1 << bit
+            if not is_beside(model, selves, world, selves.pair[start + bit * threads]):
+                may_touch |= 1 << bit
+                number += 1.0
+        found = int(group_sum(number, threads))
+        if found > 0:
+            place = end + int(sum_before(number, thread, threads))
+            while may_touch != 0:
+                bit = lowest_bit(may_touch)
+                may_touch ^= 1 << bit
+                selves.near[place, world] = start + bit * threads
+                place += 1
+            end += found
     return end
 
 
@@ -221,8 +238,10 @@ def make_self_contact(
     contact = Contact()
     contact.pos = pos
     contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
-    first, second = pose_of(selves, world, geoms[0]), pose_of(selves, world, geoms[1])
-    velocity = second.lin_vel - first.lin_vel + wp.cross(second.ang_vel - first.ang_vel, pos)
+    first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
+    velocity = selves.lin_vel[second[0], second[1], world] - selves.lin_vel[first[0], first[1], world]
+    ang_vel = selves.ang_vel[second[0], second[1], world] - selves.ang_vel[first[0], first[1], world]
+    velocity += wp.cross(ang_vel, pos)
     params = contact_params(model, world, geoms[0], geoms[1])
     named = selves.named[pair]
     if named >= 0:
@@ -237,16 +256,14 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
     """Return ``find_self_contacts`` for a number of threads per world; it has no code for other pairs of types."""
 
     @wp.func
-    def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> SelfContacts:
+    def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> Touching:
         """Write a world's contacts between parts of the robot, in the order of the pairs, and return their range.
 
-        Each thread collides one pair at a time, after all poses have been written.
+        Each thread collides one pair at a time, after all parts have been written.
         """
-        selves.first = world * MAX_SELF_CONTACTS
-        last = selves.first + MAX_SELF_CONTACTS
-        end = selves.first + 0
-        write_spheres(model, selves, world, thread, wp.static(threads))
-        sync_group(wp.static(threads))
+        first_contact = world * MAX_SELF_CONTACTS
+        last = first_contact + MAX_SELF_CONTACTS
+        end = first_contact + 0
         near = write_near(model, selves, world, thread, wp.static(threads))
         sync_group(wp.static(threads))
         for start in range(0, near, wp.static(threads)):
@@ -273,7 +290,6 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
                 end += new
         if end > last and thread == 0:
             selves.overflow[world] = selves.overflow[world] | OVERFLOW
-        selves.end = wp.min(end, last)
-        return selves
+        return Touching(first_contact, wp.min(end, last), False)
 
     return find_self_contacts

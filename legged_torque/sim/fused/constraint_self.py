@@ -7,11 +7,10 @@ so that they cannot be eliminated one by one: then all threads of the world fact
 
 import warp as wp
 
-from legged_torque.sim.fused.collision_self import SelfContacts
+from legged_torque.sim.fused.collision_self import SelfContacts, Touching
 from legged_torque.sim.fused.constraint import contact_force, contact_stiffness, expected_rows, row_values
 from legged_torque.sim.fused.math import column, group_sum3, inverse_sqrt, sync_group
 from legged_torque.sim.fused.model import Model
-from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
 from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
 
@@ -23,13 +22,6 @@ def hinge_index(model: Model, b: int, j: int) -> int:
 
 
 @wp.func
-def write_poses(selves: SelfContacts, world: int, b: int, poses: Poses):
-    """Write the poses of a branch for the other threads of its world."""
-    for d in range(poses.shape[0]):
-        selves.poses[world, b, d] = poses[d]
-
-
-@wp.func
 def write_joints(model: Model, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
     """Write the accelerations of a branch's joints, or their step, for the other threads of its world."""
     for j in range(len(values)):
@@ -38,9 +30,11 @@ def write_joints(model: Model, selves: SelfContacts, world: int, b: int, joints:
 
 
 @wp.func
-def write_jacobians(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def write_jacobians(
+    model: Model, selves: SelfContacts, touching: Touching, world: int, b: int, joints: int, branch: AnyBranch
+):
     """Write the columns of a branch's joints in the Jacobians of all contacts of its world."""
-    for k in range(selves.first, selves.end):
+    for k in range(touching.first, touching.end):
         geoms = selves.geoms[k]
         first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
         for j in range(len(branch.acc)):
@@ -61,18 +55,18 @@ def rows_times_joints(selves: SelfContacts, world: int, k: int) -> vec4:
 
 
 @wp.func
-def start_rows(selves: SelfContacts, world: int, thread: int, threads: int):
+def start_rows(selves: SelfContacts, touching: Touching, world: int, thread: int, threads: int):
     """Write the residuals of a thread's contacts at the start, and the rows that are expected to push."""
-    for k in range(selves.first + thread, selves.end, threads):
+    for k in range(touching.first + thread, touching.end, threads):
         selves.residual[k] = rows_times_joints(selves, world, k) - selves.found[k].reference
         selves.pushing[k] = expected_rows(selves.found[k])
 
 
 @wp.func
-def along_step(selves: SelfContacts, world: int, thread: int, threads: int) -> float:
+def along_step(selves: SelfContacts, touching: Touching, world: int, thread: int, threads: int) -> float:
     """Write the changes of the residuals of a thread's contacts along the step, and return the slope of their cost."""
     slope = float(0.0)
-    for k in range(selves.first + thread, selves.end, threads):
+    for k in range(touching.first + thread, touching.end, threads):
         selves.change[k] = rows_times_joints(selves, world, k)
         pushing = wp.cw_mul(selves.pushing[k], selves.residual[k])
         slope += selves.found[k].mass * wp.dot(pushing, selves.change[k])
@@ -80,21 +74,23 @@ def along_step(selves: SelfContacts, world: int, thread: int, threads: int) -> f
 
 
 @wp.func
-def with_coupling(selves: SelfContacts) -> SelfContacts:
+def with_coupling(selves: SelfContacts, touching: Touching) -> Touching:
     """Return a world's contacts, marked as coupled if one between two branches pushes."""
-    selves.coupled = False
-    for k in range(selves.first, selves.end):
+    touching.coupled = False
+    for k in range(touching.first, touching.end):
         geoms = selves.geoms[k]
         first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
         if first[0] != second[0] and first[1] > 0 and second[1] > 0 and wp.length_sq(selves.pushing[k]) > 0.0:
-            selves.coupled = True
-    return selves
+            touching.coupled = True
+    return touching
 
 
 @wp.func
-def add_to_branch(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def add_to_branch(
+    model: Model, selves: SelfContacts, touching: Touching, world: int, b: int, joints: int, branch: AnyBranch
+):
     """Return a branch with the contacts' terms in its gradient and its block of the Hessian."""
-    for k in range(selves.first, selves.end):
+    for k in range(touching.first, touching.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
         for j in range(len(branch.acc)):
@@ -109,7 +105,9 @@ def add_to_branch(model: Model, selves: SelfContacts, world: int, b: int, joints
 
 
 @wp.func
-def write_equations(model: Model, selves: SelfContacts, world: int, b: int, joints: int, branch: AnyBranch):
+def write_equations(
+    model: Model, selves: SelfContacts, touching: Touching, world: int, b: int, joints: int, branch: AnyBranch
+):
     """Write a branch's equations into the whole system: its rows, its columns in the trunk's, its right-hand side.
 
     The system has the joints first, then the trunk's translation and rotation; its last row is the right-hand side.
@@ -120,7 +118,7 @@ def write_equations(model: Model, selves: SelfContacts, world: int, b: int, join
             row = hinge_index(model, b, j)
             for c in range(size - 6):
                 selves.matrix[world, row, c] = 0.0
-            for k in range(selves.first, selves.end):
+            for k in range(touching.first, touching.end):
                 stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
                 pushed = stiffness * selves.jacobian[k, row]
                 for c in range(size - 6):

@@ -3,7 +3,7 @@
 import warp as wp
 
 from legged_torque.sim.fused.collision import contact_normal
-from legged_torque.sim.fused.collision_self import SelfContacts
+from legged_torque.sim.fused.collision_self import SelfContacts, Touching
 from legged_torque.sim.fused.constraint import contact_force
 from legged_torque.sim.fused.math import quat_multiply, quat_rotation
 from legged_torque.sim.fused.model import Model, State, dof, qadr
@@ -75,12 +75,12 @@ def sense_branch(model: Model, state: State, world: int, b: int, branch: AnyBran
 
 
 @wp.func
-def sense_self_contacts(model: Model, state: State, world: int, selves: SelfContacts):
+def sense_self_contacts(model: Model, state: State, world: int, selves: SelfContacts, touching: Touching):
     """Add contacts between parts of the robot to the sensors of both geoms, after those with the ground."""
     for k in range(selves.airborne.shape[0]):
         for r in range(4):
             state.sensordata[world, selves.airborne[k] + r] = 0.0
-    for k in range(selves.first, selves.end):
+    for k in range(touching.first, touching.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         for side in range(2):
             address = model.geom_sensor[selves.geoms[k][side]]

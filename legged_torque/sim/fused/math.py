@@ -33,6 +33,20 @@ def sum_before(value: float, thread: int, threads: int) -> float:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    return __ffs(bits) - 1;
+#else
+    int bit = 0;
+    while (!((bits >> bit) & 1)) ++bit;
+    return bit;
+#endif
+""")
+def lowest_bit(bits: int) -> int:
+    """Return the place of the lowest bit that is set, of some."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     const unsigned first = (threadIdx.x & 31u) & ~(unsigned(threads) - 1u);
     __syncwarp(((1u << threads) - 1u) << first);
 #endif

@@ -5,6 +5,7 @@ import functools
 import warp as wp
 
 from legged_torque.sim.fused import constraint_self, solver
+from legged_torque.sim.fused.collision_self import Touching
 from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.math import cholesky, group_sum, group_sum3, sync_group
 from legged_torque.sim.fused.model import Model
@@ -33,7 +34,14 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
 
     @wp.func
     def assemble(
-        model: Model, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch, rot: wp.mat33, acc: TrunkMotion
+        model: Model,
+        scratch: own.Scratch,
+        touching: Touching,
+        world: int,
+        thread: int,
+        branch: AnyBranch,
+        rot: wp.mat33,
+        acc: TrunkMotion,
     ):
         """Assemble and eliminate the branches' Newton equations.
 
@@ -47,9 +55,9 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
                 branch, add = solver.assemble(branch, rot, acc, scratch.contacts)
                 if wp.static(own.collide):
                     joints = own.num_joints(model, b)
-                    branch = constraint_self.add_to_branch(model, scratch.selves, world, b, joints, branch)
-                    if scratch.selves.coupled:
-                        constraint_self.write_equations(model, scratch.selves, world, b, joints, branch)
+                    branch = constraint_self.add_to_branch(model, scratch.selves, touching, world, b, joints, branch)
+                    if touching.coupled:
+                        constraint_self.write_equations(model, scratch.selves, touching, world, b, joints, branch)
                         whole = solver.add_whole(branch, whole, add)
                 branch.factor = cholesky(branch.factor)
                 system = solver.eliminate(branch, system, add)
@@ -58,7 +66,14 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
 
     @wp.func
     def find_step(
-        model: Model, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch, rot: wp.mat33, step: TrunkMotion
+        model: Model,
+        scratch: own.Scratch,
+        touching: Touching,
+        world: int,
+        thread: int,
+        branch: AnyBranch,
+        rot: wp.mat33,
+        step: TrunkMotion,
     ):
         """Find the branches' parts of the step; return also their slopes of the cost along it."""
         slopes = wp.vec3(0.0)
@@ -69,7 +84,7 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
                 branch.step = solver.branch_step(branch, step)
                 if wp.static(own.collide):
                     joints = own.num_joints(model, b)
-                    if scratch.selves.coupled:
+                    if touching.coupled:
                         branch.step = constraint_self.coupled_step(model, scratch.selves, world, b, joints, branch.step)
                     constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.step)
                 branch, of_rows = solver.along_step(branch, rot, step, scratch.contacts)
@@ -77,7 +92,7 @@ def step_finder(layout: Layout) -> tuple[wp.Function, wp.Function]:
             own.store(scratch, world, i, branch)
         if wp.static(own.collide):
             sync_group(wp.static(own.threads))
-            slopes[1] -= constraint_self.along_step(scratch.selves, world, thread, wp.static(own.threads))
+            slopes[1] -= constraint_self.along_step(scratch.selves, touching, world, thread, wp.static(own.threads))
         return branch, group_sum3(slopes, wp.static(own.threads))
 
     return assemble, find_step
@@ -91,6 +106,7 @@ def line_searcher(layout: Layout) -> tuple[wp.Function, wp.Function]:
     @wp.func
     def line_search(
         scratch: own.Scratch,
+        touching: Touching,
         world: int,
         thread: int,
         branch: AnyBranch,
@@ -108,7 +124,7 @@ def line_searcher(layout: Layout) -> tuple[wp.Function, wp.Function]:
                 branch = own.load(scratch, world, i, branch)
                 slopes += solver.row_slopes(branch, scratch.contacts, alpha)
             if wp.static(own.collide):
-                for k in range(scratch.selves.first + thread, scratch.selves.end, wp.static(own.threads)):
+                for k in range(touching.first + thread, touching.end, wp.static(own.threads)):
                     slopes = solver.add_contact_slopes(slopes, scratch.selves, k, alpha)
             slope = at_start[1] + alpha * at_start[2] + group_sum(slopes[0], wp.static(own.threads))
             curvature = at_start[2] + group_sum(slopes[1], wp.static(own.threads))
@@ -124,7 +140,7 @@ def line_searcher(layout: Layout) -> tuple[wp.Function, wp.Function]:
         return alpha
 
     @wp.func
-    def move(scratch: own.Scratch, world: int, thread: int, branch: AnyBranch, alpha: float):
+    def move(scratch: own.Scratch, touching: Touching, world: int, thread: int, branch: AnyBranch, alpha: float):
         """Move the branches along the step; return also how many rows of the world changed their state."""
         flips = float(0.0)
         for i in range(wp.static(own.per_thread)):
@@ -133,7 +149,7 @@ def line_searcher(layout: Layout) -> tuple[wp.Function, wp.Function]:
             flips += changed
             own.store(scratch, world, i, branch)
         if wp.static(own.collide):
-            for k in range(scratch.selves.first + thread, scratch.selves.end, wp.static(own.threads)):
+            for k in range(touching.first + thread, touching.end, wp.static(own.threads)):
                 flips += solver.move_contact(scratch.selves, k, alpha)
             sync_group(wp.static(own.threads))
         return branch, group_sum(flips, wp.static(own.threads))
@@ -150,6 +166,7 @@ def newton_solver(layout: Layout) -> wp.Function:
     def solve(
         model: Model,
         scratch: own.Scratch,
+        touching: Touching,
         world: int,
         thread: int,
         whole: WholeBody,
@@ -162,25 +179,25 @@ def newton_solver(layout: Layout) -> wp.Function:
         for _iteration in range(model.iterations):
             used += 1
             if wp.static(own.collide):
-                scratch.selves = constraint_self.with_coupling(scratch.selves)
-            branch, system, added = assemble(model, scratch, world, thread, branch, rot, acc)
+                touching = constraint_self.with_coupling(scratch.selves, touching)
+            branch, system, added = assemble(model, scratch, touching, world, thread, branch, rot, acc)
             residual = trunk_residual(whole, acc)
             step = solve_trunk(whole, residual, system, wp.static(own.threads))
             if wp.static(own.collide):  # noqa: SIM102 - this decides what is compiled
-                if scratch.selves.coupled:
+                if touching.coupled:
                     step = constraint_self.solve_system(
                         scratch.selves, world, thread, wp.static(own.threads), whole, residual, added
                     )
-            branch, slopes = find_step(model, scratch, world, thread, branch, rot, step)
+            branch, slopes = find_step(model, scratch, touching, world, thread, branch, rot, step)
             start = slopes + trunk_slopes(whole, residual, step)
             decrease = -start[0] * model.cost_scale
             if used > 1 and not (decrease > model.tolerance):
                 break
             tolerance = wp.where(used > 1, LINE_SEARCH_TOLERANCE, FIRST_TOLERANCE)
-            alpha = line_search(scratch, world, thread, branch, start, tolerance, model.ls_iterations)
+            alpha = line_search(scratch, touching, world, thread, branch, start, tolerance, model.ls_iterations)
             acc.lin = acc.lin + alpha * step.lin
             acc.ang = acc.ang + alpha * step.ang
-            branch, flips = move(scratch, world, thread, branch, alpha)
+            branch, flips = move(scratch, touching, world, thread, branch, alpha)
             if alpha == 1.0 and flips == 0.0 and decrease < EXACT_STEP:
                 break  # the whole step stayed in one piece of the piecewise quadratic cost: this is its minimum
         return branch, acc, used

@@ -12,7 +12,7 @@ import warp as wp
 from legged_torque.sim.fused import constraint_self, solver
 from legged_torque.sim.fused.collision import find_contacts, place_plane
 from legged_torque.sim.fused.collision_map import find_map_contacts, place_map
-from legged_torque.sim.fused.collision_self import self_contact_finder
+from legged_torque.sim.fused.collision_self import Touching, self_contact_finder, write_parts
 from legged_torque.sim.fused.constraint import make_joint_rows
 from legged_torque.sim.fused.integrate import integrate_branch, integrate_trunk, sense_branch, sense_self_contacts
 from legged_torque.sim.fused.layout import Layout, branches_of
@@ -58,7 +58,7 @@ def branches_maker(layout: Layout, applied_forces: bool) -> wp.Function:
             if j < joints:
                 branch.acc[j] = state.qacc_warmstart[world, dof(model.branch_joint[b, j])]
         if wp.static(own.collide):
-            constraint_self.write_poses(scratch.selves, world, b, poses)
+            write_parts(model, scratch.selves, world, b, poses)
             constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.acc)
         return branch
 
@@ -89,19 +89,22 @@ def self_constraint_maker(layout: Layout) -> wp.Function:
     @wp.func
     def make_self_constraints(model: Model, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch):
         """Find contacts between parts of the robot and their residuals at the start."""
+        touching = Touching()
         if wp.static(own.collide):
             sync_group(wp.static(own.threads))
-            scratch.selves = find_self_contacts(model, scratch.selves, world, thread)
+            touching = find_self_contacts(model, scratch.selves, world, thread)
             sync_group(wp.static(own.threads))
             for i in range(wp.static(own.per_thread)):
                 branch = own.load(scratch, world, i, branch)
                 if own.owns(thread, i):
                     b = thread + i * wp.static(own.threads)
-                    constraint_self.write_jacobians(model, scratch.selves, world, b, own.num_joints(model, b), branch)
+                    constraint_self.write_jacobians(
+                        model, scratch.selves, touching, world, b, own.num_joints(model, b), branch
+                    )
             sync_group(wp.static(own.threads))
-            constraint_self.start_rows(scratch.selves, world, thread, wp.static(own.threads))
+            constraint_self.start_rows(scratch.selves, touching, world, thread, wp.static(own.threads))
             sync_group(wp.static(own.threads))
-        return scratch
+        return touching
 
     return make_self_constraints
 
@@ -116,6 +119,7 @@ def integrator(layout: Layout) -> wp.Function:
         model: Model,
         state: State,
         scratch: own.Scratch,
+        touching: Touching,
         world: int,
         thread: int,
         branch: AnyBranch,
@@ -143,7 +147,7 @@ def integrator(layout: Layout) -> wp.Function:
         if wp.static(own.collide):
             sync_group(wp.static(own.threads))
             if sense and thread == 0:
-                sense_self_contacts(model, state, world, scratch.selves)
+                sense_self_contacts(model, state, world, scratch.selves, touching)
         if thread == 0:
             integrate_trunk(model.timestep, state, world, trunk, acc, damped)
 
@@ -180,10 +184,10 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
             trunk = apply_to_trunk(model, state, world, trunk)
         acc = warm_start(state, world)
         branch, total = make_branches(model, state, scratch, world, thread, trunk, acc)
-        scratch = make_self_constraints(model, scratch, world, thread, branch)
+        touching = make_self_constraints(model, scratch, world, thread, branch)
         whole = whole_body(trunk, total, wp.static(own.threads))
-        branch, acc, used = solve(model, scratch, world, thread, whole, branch, trunk.rot, acc)
-        integrate(model, state, scratch, world, thread, branch, whole, trunk, acc, sense)
+        branch, acc, used = solve(model, scratch, touching, world, thread, whole, branch, trunk.rot, acc)
+        integrate(model, state, scratch, touching, world, thread, branch, whole, trunk, acc, sense)
         if thread == 0:
             state.solver_niter[world] = used
 
