@@ -36,14 +36,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--domain", type=int, default=0, help="of DDS; Unitree's robots: 0; default: %(default)s")
     hint = "commands per second; default: the largest multiple of the policy's rate up to 500"
     parser.add_argument("--rate", type=float, help=hint)
-    parser.add_argument(
-        "--command",
-        type=float,
-        nargs=3,
-        metavar=("X", "Y", "YAW"),
-        default=[0.0, 0.0, 0.0],
-        help="first command: forwards, to the left [m/s], yaw rate [rad/s]; default: stand still",
-    )
+    cli.add_command_arg(parser, "first", "stand still")
+    parser.set_defaults(command=[0.0, 0.0, 0.0])
     hint = "obey JSON datagrams on a port of this machine, or of one of its addresses; docs/howto/run_on_robot.md"
     parser.add_argument("--udp", metavar="[ADDRESS:]PORT", help=hint)
     hint = "obey a gamepad; default: %(const)s"

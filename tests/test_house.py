@@ -29,21 +29,21 @@ LINES = {
     "legged_torque/experiments": 1099,
     "legged_torque/identification": 432,
     "legged_torque/importer": 1252,
-    "legged_torque/learning": 4122,
-    "legged_torque/motors": 1532,
+    "legged_torque/learning": 4128,
+    "legged_torque/motors": 1521,
     "legged_torque/runtime": 2092,
     "legged_torque/sensors": 302,
-    "legged_torque/sim": 5839,
+    "legged_torque/sim": 5837,
     "legged_torque/terrain": 586,
     "legged_torque/utils": 3335,
     "legged_torque/viewer": 2485,
-    "scripts": 2019,
+    "scripts": 2013,
     "paper": 3216,
     "tools": 1506,
     "tests": 24848,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_184  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_171  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

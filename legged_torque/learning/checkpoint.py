@@ -53,6 +53,11 @@ def on_host(content: Any) -> Any:
     return tree_map_only(Tensor, lambda tensor: tensor.detach().to("cpu", copy=True), content)
 
 
+def cloned(state: dict[str, Any]) -> dict[str, Any]:
+    """Return a state with each tensor in memory of its own."""
+    return tree_map_only(Tensor, Tensor.clone, state)
+
+
 def write(file: Path, content: dict[str, Any]) -> str:
     """Write tensors and plain values, and return the SHA-256 of the file.
 

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
 from legged_torque.envs import task_registry
+from legged_torque.learning.checkpoint import cloned
 from legged_torque.learning.memory import RememberingPolicy
 from legged_torque.learning.protocols import Transition
 from legged_torque.terrain.rough import RoughGround
@@ -114,7 +115,7 @@ class Distillation(algorithms.Distillation):
     def state_dict(self) -> dict[str, Any]:
         """Return student and optimizer, each tensor in memory of its own."""
         parts = {"actor_state_dict": self.student.state_dict(), "optimizer_state_dict": self.optimizer.state_dict()}
-        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, parts)
+        return cloned(parts)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load all parts of a :meth:`state_dict`."""

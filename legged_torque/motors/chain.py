@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from legged_torque.motors.config import MotorCfg, check_encoders
-from legged_torque.motors.joints import Joints
 from legged_torque.motors.kernel import Part, TorqueKernel, joint_torque, newest_actions
-from legged_torque.motors.motor import Motor
+from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.errors import UserError, check_names
 

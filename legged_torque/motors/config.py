@@ -16,7 +16,7 @@ class MotorCfg(Section):
     _of_policy = False  # whether the link belongs to the control law, so that it stays with other motors
 
     def build(self, joints: Any) -> Any:
-        """Return the :class:`~legged_torque.motors.motor.Motor` of :class:`~legged_torque.motors.joints.Joints`."""
+        """Return the :class:`~legged_torque.motors.motor.Motor` of :class:`~legged_torque.motors.motor.Joints`."""
         return pkgutil.resolve_name(self._motor_class)(self, joints)
 
     def describe(self) -> dict[str, Any]:

@@ -5,8 +5,7 @@ from typing import Any
 from torch import Tensor
 
 from legged_torque.motors.config import DelayCfg
-from legged_torque.motors.joints import Joints
-from legged_torque.motors.motor import Motor
+from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.packets import PacketQueue, received_packet
 from legged_torque.sim.randomization import RandomParameter
 

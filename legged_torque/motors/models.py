@@ -8,10 +8,9 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.motors.formulas import FORMULAS, SMALL
-from legged_torque.motors.joints import Joints
 from legged_torque.motors.kernel import read, struct_of
 from legged_torque.motors.model_config import ModelCfg
-from legged_torque.motors.motor import Motor
+from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.errors import UserError
 

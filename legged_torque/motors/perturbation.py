@@ -7,9 +7,8 @@ import warp as wp
 from torch import Tensor
 
 from legged_torque.motors.config import PerturbationCfg
-from legged_torque.motors.joints import Joints
 from legged_torque.motors.kernel import read
-from legged_torque.motors.motor import Motor
+from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
 
 

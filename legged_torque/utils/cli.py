@@ -282,9 +282,9 @@ def check_args(args: object, **hints: Any) -> None:
             check_value(f"--{name}", getattr(args, name), hint)
 
 
-def add_command_arg(parser: Parser) -> None:
-    """Add a fixed command of the robots."""
-    hint = "fixed command: forwards, to the left [m/s], yaw rate [rad/s]; default: drawn as in training"
+def add_command_arg(parser: Parser, kind: str = "fixed", default: str = "drawn as in training") -> None:
+    """Add a command of the robots; what it is by default is said."""
+    hint = f"{kind} command: forwards, to the left [m/s], yaw rate [rad/s]; default: {default}"
     parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 

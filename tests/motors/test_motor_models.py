@@ -15,8 +15,8 @@ from support.settings import error_of, torques_in_torch
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.motors import models
-from legged_torque.motors.joints import Joints
 from legged_torque.motors.model_config import MODELS
+from legged_torque.motors.motor import Joints
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.sim.randomization import Randomization
 from legged_torque.utils.config import update_from_dict

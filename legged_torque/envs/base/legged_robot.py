@@ -35,7 +35,7 @@ from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.terminations import Terminations
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.motors.chain import MotorChain
-from legged_torque.motors.joints import Joints
+from legged_torque.motors.motor import Joints
 from legged_torque.sensors.sensors import Sensors
 from legged_torque.sim.health import Health
 from legged_torque.sim.randomization import RandomParameter

@@ -13,8 +13,8 @@ import torch
 from rsl_rl.extensions import Symmetry
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map
 
+from legged_torque.learning.checkpoint import cloned
 from legged_torque.learning.flashsac.exploration import RepeatedNoise
 from legged_torque.learning.flashsac.networks import FlashSACActor, FlashSACCritic, bound_weights
 from legged_torque.learning.flashsac.replay import Batch, Replay
@@ -293,7 +293,7 @@ class FlashSAC:
         parts |= self._networks()
         state: dict[str, Any] = {f"{name}_state_dict": part.state_dict() for name, part in parts.items()}
         state |= {"log_temperature": self.log_temperature.detach(), "num_updates": self.num_updates}
-        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, state)
+        return cloned(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load all parts of a :meth:`state_dict`."""

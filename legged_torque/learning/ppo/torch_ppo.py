@@ -9,8 +9,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map
 
+from legged_torque.learning.checkpoint import cloned
 from legged_torque.learning.protocols import Transition
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
@@ -137,7 +137,7 @@ class TorchPPO(PPO):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what rsl_rl saves, each tensor in memory of its own."""
-        return tree_map(lambda value: value.clone() if isinstance(value, Tensor) else value, self.save())
+        return cloned(self.save())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load all parts of a :meth:`state_dict`."""

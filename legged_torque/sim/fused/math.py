@@ -35,9 +35,7 @@ def sum_before(value: float, thread: int, threads: int) -> float:
 #if defined(__CUDA_ARCH__)
     return __ffs(bits) - 1;
 #else
-    int bit = 0;
-    while (!((bits >> bit) & 1)) ++bit;
-    return bit;
+    return __builtin_ctz(bits);
 #endif
 """)
 def lowest_bit(bits: int) -> int:
