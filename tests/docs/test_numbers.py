@@ -320,13 +320,16 @@ def test_self_collision():
     data = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
     rows = pd.DataFrame(next(each["rows"] for each in data if each["what"].startswith("physics steps of an A1")))
     times = rows[rows["self_collision"]].set_index(["worlds", "robots", "commit"])["us"]
-    none = rows[~rows["self_collision"]].groupby(["worlds", "robots"])["us"].mean()
+    none = rows[~rows["self_collision"] & (rows["commit"] == "5744e68")].set_index(["worlds", "robots"])["us"]
     _, said = rows_of("performance.md", "worlds | robots | without")
     assert len(said) == 4
     for worlds, robots, *cells in said:
         key = int(worlds), robots
-        expected = [none[key], *(times[(*key, commit)] for commit in ("fba2b3b", "e41b3c4"))]
+        expected = [none[key], *(times[(*key, commit)] for commit in ("5744e68", "b4d0c40"))]
         assert [f"{us:.0f}" for us in expected] == cells, key
+    tried = [times[16384, "standing", "0bfaceb"], times[4096, "fallen", "0bfaceb"]]
+    said = "took {:.0f} us for 16384 standing robots, but {:.0f} for 4096 fallen"
+    assert said.format(*tried) in text_of("performance.md", "A kernel of its own")
 
 
 def test_faults():
