@@ -124,8 +124,8 @@ def check_combinations(args: argparse.Namespace) -> None:
     if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
     if args.agent != "policy" and (args.load_run or args.policy or args.checkpoint is not None or has_viewer):
-        of_policies = "--load_run, --policy, --checkpoint and --viewer"
-        raise UserError(f"--agent {args.agent} has no run: {of_policies} are for those of policies")
+        others = "--load_run, --policy, --checkpoint and --viewer"
+        raise UserError(f"--agent {args.agent} has no run: {others} are for policies")
     if args.headless and args.viewer == "native":
         raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
     if args.compare and args.viewer != "web":

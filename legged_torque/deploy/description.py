@@ -159,8 +159,8 @@ def require(*packages: str, extra: str = "export") -> None:
             raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")
 
 
-def beyond(description: dict[str, Any], observations: Container[str], actions: Container[str]) -> list[str]:
-    """Return what a program lacks that knows some terms of ``observations`` and ``actions``, and a plain network."""
+def not_understood(description: dict[str, Any], observations: Container[str], actions: Container[str]) -> list[str]:
+    """Return what a policy needs beyond terms of ``observations`` and ``actions`` and a network without memory."""
     observed, acted = description["observations"], description["actions"]["terms"]
     problems = [f"the observation {term['name']}" for term in observed["terms"] if term["name"] not in observations]
     problems += [f"the actions {term['name']}" for term in acted if term["name"] not in actions]

@@ -139,10 +139,14 @@ class Policy:
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
         ``policy.yaml`` are left out, since a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
         """
-        stiffness, damping = self._drive_gains
-        wanted = self.wanted_torques(actions, joint_positions, joint_velocities)
-        held = stiffness * (self.nominal_pose - self.joints(joint_positions)) - damping * self.joints(joint_velocities)
-        return np.clip(wanted + held, *self.torque_limits)
+        wanted, (stiffness, damping) = (
+            self.wanted_torques(actions, joint_positions, joint_velocities),
+            self._drive_gains,
+        )
+        if np.any(stiffness) or np.any(damping):
+            wanted += stiffness * (self.nominal_pose - self.joints(joint_positions))
+            wanted -= damping * self.joints(joint_velocities)
+        return np.clip(wanted, *self.torque_limits)
 
     def wanted_torques(
         self, actions: np.ndarray, joint_positions: np.ndarray, joint_velocities: np.ndarray

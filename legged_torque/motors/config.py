@@ -13,7 +13,7 @@ class MotorCfg(Section):
     """Settings of a link. Inherit for a model of your own, and override :meth:`build`."""
 
     _motor_class = ""  # "module:Class", imported when it is built
-    _of_policy = False  # whether the link belongs to the control law, so that it stays with other motors
+    _of_law = False  # whether the link belongs to the control law, so that it stays with other motors
 
     def build(self, joints: Any) -> Any:
         """Return the :class:`~legged_torque.motors.motor.Motor` of :class:`~legged_torque.motors.motor.Joints`."""

@@ -1,5 +1,6 @@
 """Settings of motor models: constants by joint, which may be drawn at random in each world. They need no torch."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
@@ -81,7 +82,7 @@ class CurveCfg(ModelCfg):
 class DriveCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.drive`: gains that the drive itself closes."""
 
-    _model, _of_policy = "drive", True
+    _model, _of_law = "drive", True
     damping: PerJoint = 0.0  # [N m s/rad] Kd
     stiffness: PerJoint = 0.0  # [N m/rad] Kp, towards the nominal pose
 
@@ -125,7 +126,7 @@ class MuscleCfg(ModelCfg):
     """Settings of :func:`~legged_torque.motors.formulas.muscle`, see :mod:`legged_torque.envs.approaches.sata`."""
 
     _motor_class = "legged_torque.motors.models:MuscleModel"
-    _model, _of_policy = "muscle", True
+    _model, _of_law = "muscle", True
     activation_time: PositivePerJoint = -0.005 / math.log(0.4)  # [s] time constant of the activation
     recovery_time: PositivePerJoint = -0.005 / math.log(0.9)  # [s] of the fatigue
     no_load_speed: PositivePerJoint = 21.0  # [rad/s] at which a joint has no torque; of the A1
@@ -222,25 +223,24 @@ class MotorsCfg(Section):
     network = NetworkCfg  # a network from logged data, in torch
     joints = JointsCfg  # no link: inertia and friction of joints
 
-    def of_policy(self) -> list[str]:
-        """Return the links of the chain that belong to the control law, whatever the motors are."""
-        return [name for name in self.chain if getattr(getattr(self, name, None), "_of_policy", False)]
-
     def choose(self, name: str) -> None:
-        """Make one of :attr:`choices` the chain, where links of the control law stay; a UserError without it."""
+        """Make one of :attr:`choices` the chain; links of the control law stay. A UserError if there is none."""
         check_names("motors", [name], self.choices)
-        chosen = self.choices[name]
-        kept = [link for link in self.of_policy() if link not in chosen]
-        place = sum(isinstance(getattr(self, link, None), DelayCfg) for link in chosen)  # delays are the first
-        self.chain = [*chosen[:place], *kept, *chosen[place:]]
+        chosen, links = self.choices[name], {link: getattr(self, link, None) for link in self.chain}
+        kept = [key for key, link in links.items() if getattr(link, "_of_law", False) and key not in chosen]
+        before = itertools.takewhile(lambda link: not isinstance(getattr(self, link, None), ModelCfg), chosen)
+        place = len(list(before))  # behind what acts on actions
+        self.chain: list[str] = [*chosen[:place], *kept, *chosen[place:]]
 
     def restore(self, described: dict[str, dict[str, Any]]) -> None:
         """Take chain and constants of ``policy.yaml``; delays stay. A UserError if a link is none of the task's."""
         delays = [name for name in self.chain if isinstance(getattr(self, name, None), DelayCfg)]
         for name, values in described.items():
             link, path = getattr(self, name, None), f"motors.{name}"
-            if not isinstance(link, ModelCfg) or link._model != values["model"]:
-                raise UserError(f"the policy's task has no {path} of the model '{values['model']}'")
+            if not isinstance(link, ModelCfg) or link._model != values.get("model"):
+                raise UserError(f"the policy's task has no {path} of the model '{values.get('model')}'")
+            if isinstance(link, NetworkCfg):
+                link.file = ""  # of the task's network
             update_from_dict(link, {key: value for key, value in values.items() if key != "model"}, path)
         self.chain = [*delays, *(described or ["ideal"])]
 
@@ -259,7 +259,5 @@ class MotorsCfg(Section):
 
     def describe(self) -> dict[str, dict[str, Any]]:
         """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""
-        links = {name: getattr(self, name) for name in self.chain}
-        return {
-            name: link.describe() for name, link in links.items() if not isinstance(link, (DelayCfg, PerturbationCfg))
-        }
+        links = ((name, getattr(self, name)) for name in self.chain)
+        return {name: link.describe() for name, link in links if not isinstance(link, (DelayCfg, PerturbationCfg))}

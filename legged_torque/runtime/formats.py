@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legged_torque.deploy.description import NETWORK_FILE, beyond, read, require
+from legged_torque.deploy.description import NETWORK_FILE, not_understood, read, require
 from legged_torque.runtime.interface import JOINT_ORDER
 from legged_torque.utils.errors import refuse
 from legged_torque.utils.plain_yaml import Dumper
@@ -20,7 +20,7 @@ UNITREE |= {"joint_position": "joint_pos_rel", "joint_velocity": "joint_vel_rel"
 def _read(folder: Path, known_actions: set[str]) -> tuple[dict[str, Any], list[str]]:
     """Return the description of an export, and what of it neither format has."""
     description, _ = read(folder)
-    problems = [*description.get("unsupported", []), *beyond(description, UNITREE, known_actions)]
+    problems = [*description.get("unsupported", []), *not_understood(description, UNITREE, known_actions)]
     motors = description.get("motors", {}).items()
     problems += [f"the gains of the motors' {name}" for name, motor in motors if motor.get("model") == "drive"]
     return description, problems

@@ -52,13 +52,19 @@ class Session:
             self.log.add(now, missed, received, command)
 
     def close(self) -> None:
-        """Leave the robot in damping, after the loop has ended; transport and log are closed even if that fails."""
+        """Leave the robot in damping, after the loop has ended; what fails meanwhile is raised at the end."""
         self.controller.request(Mode.DAMPING)
         end = time.monotonic() + FAREWELL
         with contextlib.ExitStack() as parts:
             if self.log:
                 parts.callback(self.log.close)
             parts.callback(self._transport.close)
+            error: Exception | None = None
             while time.monotonic() < end:
-                self.tick(self._clock(), missed=False)
+                try:
+                    self.tick(self._clock(), missed=False)
+                except Exception as failure:  # the next message may arrive
+                    error = failure
                 time.sleep(self.controller.period)
+            if error:
+                raise error

@@ -62,9 +62,9 @@ class SimRobot:
     ) -> None:
         """Put the robot of a file on a plane, lying; it sends ``rate`` messages a second.
 
-        Its motors are ideal unless their settings are given, of which commands bring what belongs to the control law;
-        they reach them after ``latency`` [s]. If it ``hangs``, it is held by its trunk and touches nothing. A UserError
-        if the file is unreadable, or the robot has other joints than hips, thighs and calves.
+        Its motors are ideal unless their settings are given; gains of a drive come with commands, which arrive
+        ``latency`` [s] late. If it ``hangs``, it is held by its trunk and touches nothing. A UserError if the file is
+        unreadable, or the robot has other joints than hips, thighs and calves.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -139,7 +139,7 @@ class SimRobot:
         gains = {"stiffness": zeros, "damping": zeros}
         described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
         links = motors.describe().items() if motors else ()
-        own = {name: link for name, link in links if motors and name not in motors.of_policy()}
+        own = {name: link for name, link in links if link["model"] != "drive"}
         return {**described, "gains": gains, "motors": own}
 
     def says(self) -> tuple[RobotState | None, bool]:

@@ -30,7 +30,7 @@ SETTINGS: dict[str, Any] = {
 NETWORK_SETTINGS = SETTINGS | {
     "options": SETTINGS["options"] | {"aggressive_fusion": False, "combo_kernels": False, "compile_threads": 8}
 }
-"""The same for networks, whose combined kernels compile for minutes, or need more memory than a processor has."""
+"""The same for networks that learn, whose combined kernels compile for minutes, or need too much memory."""
 FIRST_TORCH = (2, 10)  # whose compiler promises the same bits in every process ("deterministic")
 MOST_VERSIONS = 256  # of a function: one per task in the process, and per Python number that it reads
 

@@ -283,7 +283,7 @@ def check_args(args: object, **hints: Any) -> None:
 
 
 def add_command_arg(parser: Parser, kind: str = "fixed", default: str = "drawn as in training") -> None:
-    """Add a command of the robots; what it is by default is said."""
+    """Add a command of the robots; ``default`` says what it is if none is given."""
     hint = f"{kind} command: forwards, to the left [m/s], yaw rate [rad/s]; default: {default}"
     parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 

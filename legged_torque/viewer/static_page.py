@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from legged_torque import resource_path
-from legged_torque.deploy.description import beyond
+from legged_torque.deploy.description import not_understood
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.motors.twin import constants
@@ -49,7 +49,7 @@ ACTIONS, MOTORS = ("position_residual", "torque"), ("ideal", "drive", "curve", "
 
 def check(policy: Policy) -> None:
     """Refuse what the page cannot compute, with a UserError that lists it."""
-    problems, motors = beyond(policy.description, OBSERVATIONS, ACTIONS), policy.description.get("motors", {})
+    problems, motors = not_understood(policy.description, OBSERVATIONS, ACTIONS), policy.description.get("motors", {})
     problems += [f"the motor {name}" for name, each in motors.items() if each["model"] not in MOTORS]
     refuse(problems, "the page cannot compute")
 

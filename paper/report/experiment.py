@@ -123,7 +123,7 @@ class Experiment:
         return self.plan.ranges or " and ".join(sorted(set(map(ranges_of, configs)))) or "unknown"
 
     def last_part(self) -> float:
-        """Return where the last :data:`LAST_SHARE` of the longest training begins [steps], of long ones in millions."""
+        """Return where the last :data:`LAST_SHARE` of the longest training begins [steps], in millions from ten on."""
         steps = (1.0 - LAST_SHARE) * max((run.total_steps for run in self.runs), default=PAPER_STEPS)
         return round(steps, -6) if steps >= 1e7 else steps
 

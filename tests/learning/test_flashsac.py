@@ -111,7 +111,7 @@ def test_a_ring_of_another_size(rows, steps, fits):
         rings[0].add(Transition(obs, actions, rewards, *rest), actions)
         obs = after
     if not fits:
-        with pytest.raises(ValueError, match=f"replay_buffer_size is {4 * rows} steps, and a ring of "):
+        with pytest.raises(ValueError, match=f"replay_buffer_size is {4 * rows} steps, and "):
             rings[1].load_state_dict(rings[0].state_dict())
         return
     rings[1].load_state_dict(rings[0].state_dict())

@@ -87,6 +87,7 @@ def put(sim, states):
 
 
 SELF_SCRATCH = {
+    "sphere",
     "lin_vel",
     "ang_vel",
     "x_axis",

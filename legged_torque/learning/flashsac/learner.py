@@ -98,8 +98,12 @@ class FlashSAC:
         self.num_updates = 0
         steps = {learns: functools.partial(self.take_gradient_step, learns) for learns in (True, False)}
         self.graphs = {learns: CudaGraph(step, device) for learns, step in steps.items()}
-        self._run: dict[str, Callable] = {"act": self._random_actions, "keep": self._remember, "draw": self._sample}
-        self._run |= {"actor": self.actor_loss, "critic": self.critic_loss, "bound": bound_weights}
+        self._parts: dict[str, Callable] = {
+            "act": self._random_actions,
+            "remember": self._remember,
+            "sample": self._sample,
+        }
+        self._parts |= {"actor": self.actor_loss, "critic": self.critic_loss, "bound": bound_weights}
         self.uses_bfloat16 = False
 
     @classmethod
@@ -127,7 +131,7 @@ class FlashSAC:
     def compile(self) -> None:
         """Let its parts run as few kernels, where they can be compiled."""
         device, learned = self.replay.device, ("actor", "critic", "bound")
-        self._run = {name: compiled(part, device, learns=name in learned) for name, part in self._run.items()}
+        self._parts = {name: compiled(part, device, learns=name in learned) for name, part in self._parts.items()}
 
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
@@ -144,7 +148,7 @@ class FlashSAC:
 
     def act(self, obs: TensorDict) -> Tensor:
         """Return random actions in the task's units. Shape: (num_envs, num_actions)."""
-        return self._run["act"](obs)
+        return self._parts["act"](obs)
 
     def _random_actions(self, obs: TensorDict) -> Tensor:
         """Return random actions for :meth:`act`."""
@@ -156,7 +160,7 @@ class FlashSAC:
     def observe(self, transition: Transition) -> None:
         """Keep a step, and let the scale of rewards follow it."""
         self.allocate()  # of a training that keeps no run
-        self._run["keep"](transition)
+        self._parts["remember"](transition)
 
     def _remember(self, transition: Transition) -> None:
         """Keep a step for :meth:`observe`."""
@@ -210,7 +214,7 @@ class FlashSAC:
 
     def take_gradient_step(self, actor_learns: bool) -> None:
         """Draw samples; let the actor learn from them, if it does, then the critic; let the target follow."""
-        batch = self._run["draw"]()
+        batch = self._parts["sample"]()
         if actor_learns:
             self._descend("actor", batch, self.actor)
         self._descend("critic", batch, self.critic)
@@ -267,7 +271,7 @@ class FlashSAC:
     def _descend(self, name: str, batch: Batch, network: nn.Module) -> None:
         """Take a step of the optimizer ``name``, bound the weights of its network, and sum up the loss's numbers."""
         with torch.autocast("cuda", torch.bfloat16, enabled=self.uses_bfloat16):
-            loss, numbers = self._run[name](batch)
+            loss, numbers = self._parts[name](batch)
         optimizer = self.optimizers[name]
         parameters = optimizer.param_groups[0]["params"]
         optimizer.zero_grad()
@@ -275,7 +279,7 @@ class FlashSAC:
         norm = nn.utils.get_total_norm([parameter.grad for parameter in parameters])
         self._skip.copy_(~torch.isfinite(norm))
         optimizer.step()
-        self._run["bound"](network)
+        self._parts["bound"](network)
         made = 1.0 - self._skip
         all_numbers = torch.cat([numbers, torch.stack([norm, made])])
         self._sums[name] += torch.where(self._skip.bool(), 0.0, all_numbers)
@@ -326,7 +330,7 @@ class FlashSAC:
         return state | ({"replay": self.replay.state_dict()} if self.settings["save_replay"] else {})
 
     def load_world_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from a :meth:`world_state_dict`, all or nothing; a line says so if it has no replay."""
+        """Continue from a :meth:`world_state_dict`; a line says so if it has no replay."""
         if "replay" in state:
             self.replay.load_state_dict(state["replay"])
         else:

@@ -5,7 +5,7 @@ the root of their number. Features pass a batch normalization, whose running mea
 RMS normalization before the last layer. Gradients are bounded by these and by the critic's cross-entropy.
 
 ``copies`` are leading dimensions of all weights: () for a single network, (2,) for two critics in one. Inside, samples
-are columns: a normalization then runs along memory, and the gradients of weights come out as weights are.
+are columns: batch normalizations then run along memory, and gradients of weights have the layout of the weights.
 """
 
 import copy
@@ -38,7 +38,7 @@ class UnitLinear(nn.Module):
         return product.float()
 
     def aligned_product(self, x: Tensor) -> Tensor:
-        """Return the outputs by a product of multiples of 8 numbers, since a GPU takes far longer for other sizes."""
+        """Return the outputs by a product with multiples of 8 inputs and outputs, far faster on a GPU."""
         num_outputs, num_inputs = self.weight.shape[-2], self.weight.shape[-1]
         behind, below = -num_inputs % 8, -num_outputs % 8
         weight = nn.functional.pad(self.weight, [0, behind, 0, below])
@@ -249,8 +249,8 @@ class FlashSACCritic(nn.Module):
         """
         inputs = torch.cat([*(obs[group] for group in self.obs_groups), actions], dim=-1)
         features = self.trunk(inputs.expand(2, *inputs.shape), learning)
-        values = self.head(features).transpose(-1, -2) + self.head_shift.unsqueeze(-2)
-        log_probs = torch.log_softmax(values, dim=-1)
+        logits = self.head(features).transpose(-1, -2) + self.head_shift.unsqueeze(-2)
+        log_probs = torch.log_softmax(logits, dim=-1)
         return log_probs, (log_probs.exp() * self.values).sum(dim=-1)
 
 

@@ -142,7 +142,7 @@ class Replay:
         rows = len(state["_rewards"])
         if rows != min(int(state["count"]), self.rows):
             had, room = rows * self.num_envs, self.rows * self.num_envs
-            raise ValueError(f"flashsac.replay_buffer_size is {room} steps, and a ring of {had} was kept")
+            raise ValueError(f"flashsac.replay_buffer_size is {room} steps, and {had} of another size were kept")
         self.allocate()
         for name, kept in self._steps.items():
             kept[: len(state[name])] = state[name].to(kept.device)

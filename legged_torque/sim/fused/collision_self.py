@@ -58,7 +58,7 @@ class SelfContacts:
     sphere: wp.array2d(dtype=vec4)  # (geom, world): position from there, and the radius of a sphere around the geom
     x_axis: wp.array2d(dtype=vec4)  # of the geom, with a 0 behind, so that it is read at once
     z_axis: wp.array2d(dtype=vec4)
-    near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, in order
+    near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, those of each thread in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
     pushing: wp.array(dtype=vec4)
@@ -74,7 +74,7 @@ class SelfContacts:
 
 @wp.struct
 class Touching:
-    """The contacts of a thread's world; not in the struct of arrays, of which a thread that writes in it has a copy."""
+    """The contacts of a thread's world; apart from the arrays, since writing into a struct copies all of it."""
 
     first: wp.int32
     end: wp.int32
