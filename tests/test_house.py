@@ -24,7 +24,7 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 219,
-    "legged_torque/deploy": 1548,
+    "legged_torque/deploy": 1546,
     "legged_torque/envs": 5281,
     "legged_torque/experiments": 1099,
     "legged_torque/identification": 432,
@@ -43,7 +43,7 @@ LINES = {
     "tests": 24861,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_183  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_181  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -139,10 +139,8 @@ class Policy:
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
         ``policy.yaml`` are left out, since a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
         """
-        wanted, (stiffness, damping) = (
-            self.wanted_torques(actions, joint_positions, joint_velocities),
-            self._drive_gains,
-        )
+        stiffness, damping = self._drive_gains
+        wanted = self.wanted_torques(actions, joint_positions, joint_velocities)
         if np.any(stiffness) or np.any(damping):
             wanted += stiffness * (self.nominal_pose - self.joints(joint_positions))
             wanted -= damping * self.joints(joint_velocities)

@@ -139,7 +139,7 @@ class SimRobot:
         gains = {"stiffness": zeros, "damping": zeros}
         described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
         links = motors.describe().items() if motors else ()
-        own = {name: link for name, link in links if link["model"] != "drive"}
+        own = {name: link for name, link in links if link.get("model") != "drive"}
         return {**described, "gains": gains, "motors": own}
 
     def says(self) -> tuple[RobotState | None, bool]:
