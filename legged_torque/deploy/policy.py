@@ -141,7 +141,7 @@ class Policy:
         """
         stiffness, damping = self._drive_gains
         wanted = self.wanted_torques(actions, joint_positions, joint_velocities)
-        if np.any(stiffness) or np.any(damping):
+        if np.any(stiffness) or np.any(damping):  # a torque policy without a drive needs no measurements
             wanted += stiffness * (self.nominal_pose - self.joints(joint_positions))
             wanted -= damping * self.joints(joint_velocities)
         return np.clip(wanted, *self.torque_limits)
