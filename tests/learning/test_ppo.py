@@ -328,3 +328,17 @@ def test_elu_on_a_cpu():
         outputs.sum().backward()
         found.append((outputs, values.grad))
     torch.testing.assert_close(*found, rtol=0.0, atol=1.2e-7, equal_nan=True)
+
+
+def test_linear_layer_on_a_cpu():
+    """It and its gradients are those of float64 to rounding."""
+    torch.manual_seed(1)
+    layer, inputs, weights = nn.Linear(45, 128), torch.randn(300, 45), torch.randn(300, 128)
+    found = []
+    for layer_of, dtype in ((lambda values: run_network([layer], values), torch.float32), (layer, torch.float64)):
+        layer.to(dtype).zero_grad()
+        values = inputs.to(dtype, copy=True).requires_grad_()
+        outputs = layer_of(values)
+        (weights.to(dtype) * outputs).sum().backward()
+        found.append([each.double() for each in (outputs, values.grad, layer.weight.grad, layer.bias.grad)])
+    torch.testing.assert_close(*found, rtol=1e-5, atol=2e-5)

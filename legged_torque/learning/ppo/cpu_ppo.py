@@ -16,7 +16,7 @@ from legged_torque.learning.ppo.torch_ppo import TorchPPO
 class CpuPPO(TorchPPO):
     """Does what :class:`TorchPPO` does, for networks with ELUs.
 
-    Mirror images are made once per rollout, no actions are sampled to learn, and ELUs are faster.
+    Mirror images are made once per rollout, no actions are sampled to learn, and products and ELUs are faster.
     """
 
     _samples: tuple[Tensor, ...]  # of a rollout and its mirror images: what actor and critic see, and actions
@@ -62,8 +62,35 @@ def run_network(network: nn.Module, inputs: Tensor) -> Tensor:
         torques = run_network(network.torque_head, torch.cat([features, positions], dim=-1))
         return torch.cat([positions, torques], dim=-1)
     for layer in network:  # type: ignore[attr-defined]
-        inputs = _Elu.apply(inputs) if isinstance(layer, nn.ELU) else layer(inputs)
+        if isinstance(layer, nn.Linear):
+            inputs = _Linear.apply(inputs, layer.weight, layer.bias)
+        else:
+            inputs = _Elu.apply(inputs) if isinstance(layer, nn.ELU) else layer(inputs)
     return inputs
+
+
+class _Linear(torch.autograd.Function):
+    """A linear layer by oneDNN, which is twice as fast as MKL on AMD's processors."""
+
+    @staticmethod
+    def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """Return the outputs. Shapes: (samples, inputs), (outputs, inputs) and (outputs,)."""
+        ctx.save_for_backward(inputs, weight)
+        return _product(inputs, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Return the gradients of inputs, weight and bias."""
+        inputs, weight = ctx.saved_tensors
+        of_inputs = _product(gradient, weight.T) if ctx.needs_input_grad[0] else None
+        return of_inputs, _product(gradient.T, inputs.T), gradient.sum(0)
+
+
+def _product(left: Tensor, right: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Return the product of a matrix and the transpose of another one, plus a bias, all float32."""
+    if not torch.backends.mkldnn.is_available():  # oneDNN by its old name
+        return nn.functional.linear(left, right, bias)
+    return torch.ops.mkldnn._linear_pointwise(left, right, bias, "none", [], "")
 
 
 class _Elu(torch.autograd.Function):
