@@ -33,17 +33,17 @@ LINES = {
     "legged_torque/motors": 1519,
     "legged_torque/runtime": 2098,
     "legged_torque/sensors": 302,
-    "legged_torque/sim": 5978,
+    "legged_torque/sim": 5837,
     "legged_torque/terrain": 586,
     "legged_torque/utils": 3335,
     "legged_torque/viewer": 2485,
     "scripts": 2013,
     "paper": 3216,
     "tools": 1506,
-    "tests": 24881,
+    "tests": 24876,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_349  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_208  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -55,19 +55,14 @@ def own_contacts(kinds, places, quats):
     collide = getattr(collision_primitive, "_".join(kinds))
 
     @wp.kernel(module="unique", enable_backward=False)
-    def collide_all(
-        a: wp.array(dtype=Shape), b: wp.array(dtype=Shape), out: PairContacts, number: wp.array(dtype=wp.int32)
-    ):
+    def collide_all(a: wp.array(dtype=Shape), b: wp.array(dtype=Shape), out: wp.array(dtype=PairContacts)):
         """Collide one pair."""
-        number[wp.tid()] = collide(a[wp.tid()], b[wp.tid()], out, wp.tid())
+        out[wp.tid()] = collide(a[wp.tid()], b[wp.tid()])
 
     shapes = [shapes_of(*each) for each in zip(kinds, places, quats, strict=True)]
-    out, number = PairContacts(), wp.empty(COUNT, dtype=wp.int32, device="cpu")
-    for name, dtype in (("dist", wp.float32), ("pos", wp.vec3), ("normal", wp.vec3)):
-        setattr(out, name, wp.empty((8, COUNT), dtype=dtype, device="cpu"))
-    wp.launch(collide_all, COUNT, [*shapes, out, number], device="cpu")
-    dist, pos, normal = (getattr(out, name).numpy() for name in ("dist", "pos", "normal"))
-    return [[(dist[i, k], pos[i, k], normal[i, k]) for i in range(n)] for k, n in enumerate(number.numpy())]
+    out = wp.empty(COUNT, dtype=PairContacts, device="cpu")
+    wp.launch(collide_all, COUNT, [*shapes, out], device="cpu")
+    return [[(row["dist"][i], row["pos"][i], row["normal"][i]) for i in range(row["count"])] for row in out.numpy()]
 
 
 def difference(ours, theirs):

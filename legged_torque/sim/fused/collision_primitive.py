@@ -3,7 +3,7 @@
 import warp as wp
 
 from legged_torque.sim.fused.math import column
-from legged_torque.sim.fused.types import mat83
+from legged_torque.sim.fused.types import mat83, vec8
 
 MAX_PAIR_CONTACTS = wp.constant(8)
 NEVER = wp.constant(1.0e30)
@@ -30,14 +30,12 @@ class Shape:
 
 @wp.struct
 class PairContacts:
-    """Room for contacts of two geoms at each place: (contact, place).
+    """The contacts of two geoms: the first ``count`` entries."""
 
-    In memory, since a thread's own arrays would slow down the whole step that has this code.
-    """
-
-    dist: wp.array2d(dtype=wp.float32)  # negative [m]
-    pos: wp.array2d(dtype=wp.vec3)  # midway between the surfaces
-    normal: wp.array2d(dtype=wp.vec3)  # from the first geom to the second
+    count: wp.int32
+    dist: vec8  # negative [m]
+    pos: mat83  # midway between the surfaces
+    normal: mat83  # from the first geom to the second
 
 
 @wp.struct
@@ -49,33 +47,31 @@ class Polygon:
 
 
 @wp.func
-def add_contact(out: PairContacts, place: int, count: int, dist: float, pos: wp.vec3, normal: wp.vec3) -> int:
-    """Write one more contact, if it is one, and return their number."""
-    if dist < 0.0 and count < MAX_PAIR_CONTACTS:
-        out.dist[count, place] = dist
-        out.pos[count, place] = pos
-        out.normal[count, place] = normal
-        count += 1
-    return count
+def add_contact(out: PairContacts, dist: float, pos: wp.vec3, normal: wp.vec3) -> PairContacts:
+    """Return contacts with one more, if it is one."""
+    if dist < 0.0 and out.count < MAX_PAIR_CONTACTS:
+        out.dist[out.count] = dist
+        out.pos[out.count] = pos
+        out.normal[out.count] = normal
+        out.count += 1
+    return out
 
 
 @wp.func
-def add_spheres(
-    out: PairContacts, place: int, count: int, a: wp.vec3, radius_a: float, b: wp.vec3, radius_b: float
-) -> int:
-    """Add the contact of two spheres, as :func:`add_contact`."""
+def add_spheres(out: PairContacts, a: wp.vec3, radius_a: float, b: wp.vec3, radius_b: float) -> PairContacts:
+    """Return contacts with that of two spheres."""
     apart = b - a
     length = wp.length(apart)
     normal = wp.vec3(1.0, 0.0, 0.0)
     if length > 0.0:
         normal = apart / length
     dist = length - (radius_a + radius_b)
-    return add_contact(out, place, count, dist, a + (radius_a + 0.5 * dist) * normal, normal)
+    return add_contact(out, dist, a + (radius_a + 0.5 * dist) * normal, normal)
 
 
 @wp.func
-def add_sphere_box(out: PairContacts, place: int, count: int, centre: wp.vec3, radius: float, box: Shape) -> int:
-    """Add the contact of a sphere and a box, as :func:`add_contact`."""
+def add_sphere_box(out: PairContacts, centre: wp.vec3, radius: float, box: Shape) -> PairContacts:
+    """Return contacts with that of a sphere and a box."""
     local = wp.transpose(box.rot) * (centre - box.pos)
     apart = wp.max(-box.size, wp.min(box.size, local)) - local
     length = wp.length(apart)
@@ -88,8 +84,7 @@ def add_sphere_box(out: PairContacts, place: int, count: int, centre: wp.vec3, r
         normal[k] = -wp.sign(local[k])
         length = -depth[k]
     dist = length - radius
-    turned = box.rot * normal
-    return add_contact(out, place, count, dist, centre + (radius + 0.5 * dist) * turned, turned)
+    return add_contact(out, dist, centre + (radius + 0.5 * dist) * (box.rot * normal), box.rot * normal)
 
 
 @wp.func
@@ -123,38 +118,38 @@ def are_parallel(u: wp.vec3, v: wp.vec3) -> bool:
 
 
 @wp.func
-def sphere_sphere(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contact of two spheres."""
-    return add_spheres(out, place, 0, a.pos, a.size[0], b.pos, b.size[0])
+def sphere_sphere(a: Shape, b: Shape) -> PairContacts:
+    """Return the contact of two spheres."""
+    return add_spheres(PairContacts(), a.pos, a.size[0], b.pos, b.size[0])
 
 
 @wp.func
-def sphere_capsule(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contact of a sphere and a capsule."""
+def sphere_capsule(a: Shape, b: Shape) -> PairContacts:
+    """Return the contact of a sphere and a capsule."""
     axis = column(b.rot, 2)
     nearest = b.pos + wp.clamp(wp.dot(axis, a.pos - b.pos), -b.size[1], b.size[1]) * axis
-    return add_spheres(out, place, 0, a.pos, a.size[0], nearest, b.size[0])
+    return add_spheres(PairContacts(), a.pos, a.size[0], nearest, b.size[0])
 
 
 @wp.func
-def sphere_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contact of a sphere and a box."""
-    return add_sphere_box(out, place, 0, a.pos, a.size[0], b)
+def sphere_box(a: Shape, b: Shape) -> PairContacts:
+    """Return the contact of a sphere and a box."""
+    return add_sphere_box(PairContacts(), a.pos, a.size[0], b)
 
 
 @wp.func
-def capsule_capsule(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contacts of two capsules: one, or one at each end of their overlap if parallel."""
+def capsule_capsule(a: Shape, b: Shape) -> PairContacts:
+    """Return the contacts of two capsules: one, or one at each end of their overlap if parallel."""
     u, v, apart = axis_of(a), axis_of(b), b.pos - a.pos
-    count = int(0)
+    out = PairContacts()
     if are_parallel(u, v):
         for end in range(2):
             at = nearest_from(2.0 * float(end) - 1.0, u, v, apart)
-            count = add_spheres(out, place, count, a.pos + at[0] * u, a.size[0], b.pos + at[1] * v, b.size[0])
+            out = add_spheres(out, a.pos + at[0] * u, a.size[0], b.pos + at[1] * v, b.size[0])
     else:
         at = nearest_on_lines(u, v, apart)
-        count = add_spheres(out, place, count, a.pos + at[0] * u, a.size[0], b.pos + at[1] * v, b.size[0])
-    return count
+        out = add_spheres(out, a.pos + at[0] * u, a.size[0], b.pos + at[1] * v, b.size[0])
+    return out
 
 
 @wp.struct
@@ -221,11 +216,11 @@ def nearest_on_axis(pos: wp.vec3, half: wp.vec3, size: wp.vec3) -> OnBox:
 
 
 @wp.func
-def capsule_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contacts of a capsule and a box: where they are nearest, and the last point that is over the box."""
+def capsule_box(a: Shape, b: Shape) -> PairContacts:
+    """Return the contacts of a capsule and a box: where they are nearest, and the last point that is over the box."""
     pos, half = wp.transpose(b.rot) * (a.pos - b.pos), wp.transpose(b.rot) * axis_of(a)
     best = nearest_on_axis(pos, half, b.size)
-    count = add_sphere_box(out, place, 0, a.pos + best.along * axis_of(a), a.size[0], b)
+    out = add_sphere_box(PairContacts(), a.pos + best.along * axis_of(a), a.size[0], b)
     if best.way != 0.0:
         left = 1.0 - best.way * best.along
         for k in range(3):
@@ -233,8 +228,8 @@ def capsule_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
             until_end = (b.size[k] - wp.sign(speed) * best.nearest[k]) / wp.abs(speed)
             if until_end > 0.0:
                 left = wp.min(left, until_end)
-        count = add_sphere_box(out, place, count, a.pos + (best.along + best.way * left) * axis_of(a), a.size[0], b)
-    return count
+        out = add_sphere_box(out, a.pos + (best.along + best.way * left) * axis_of(a), a.size[0], b)
+    return out
 
 
 @wp.func
@@ -279,8 +274,8 @@ def clip(polygon: Polygon, k: int, side: float, limit: float) -> Polygon:
 
 
 @wp.func
-def face_contacts(a: Shape, b: Shape, f: int, sign: float, out: PairContacts, place: int) -> int:
-    """Write the contacts of a face of ``a`` across its axis ``f`` with the face of ``b`` that is turned to it.
+def face_contacts(a: Shape, b: Shape, f: int, sign: float) -> PairContacts:
+    """Return the contacts of a face of ``a`` across its axis ``f`` with the face of ``b`` that is turned to it.
 
     They are the corners of that face, clipped by the sides of the first; ``sign`` is that of their normals.
     """
@@ -297,7 +292,7 @@ def face_contacts(a: Shape, b: Shape, f: int, sign: float, out: PairContacts, pl
         face.corner[i] = wp.vec3(corner[x], corner[y], side * corner[f] - a.size[f])  # the last one is the distance
     for i in range(4):
         face = clip(face, i // 2, wp.where(i % 2 == 0, 1.0, -1.0), wp.where(i < 2, a.size[x], a.size[y]))
-    count = int(0)
+    out = PairContacts()
     least = DUPLICATE * (a.size[x] * a.size[x] + a.size[y] * a.size[y])
     for i in range(face.count):
         corner = face.corner[i]
@@ -310,15 +305,13 @@ def face_contacts(a: Shape, b: Shape, f: int, sign: float, out: PairContacts, pl
             pos[x] = corner[0]
             pos[y] = corner[1]
             pos[f] = side * (a.size[f] + 0.5 * corner[2])
-            count = add_contact(out, place, count, corner[2], a.pos + a.rot * pos, sign * side * column(a.rot, f))
-    return count
+            out = add_contact(out, corner[2], a.pos + a.rot * pos, sign * side * column(a.rot, f))
+    return out
 
 
 @wp.func
-def edge_contact(
-    a: Shape, b: Shape, i: int, j: int, axis: wp.vec3, rot: wp.mat33, apart: wp.vec3, out: PairContacts, place: int
-) -> int:
-    """Write the contact of two edges along the axes ``i`` and ``j`` of the boxes, across an axis from a to b."""
+def edge_contact(a: Shape, b: Shape, i: int, j: int, axis: wp.vec3, rot: wp.mat33, apart: wp.vec3) -> PairContacts:
+    """Return the contact of two edges along the axes ``i`` and ``j`` of the boxes, across an axis from a to b."""
     u, v = a.size[i] * unit(i), b.size[j] * column(rot, j)
     turned = wp.transpose(rot) * axis
     first, second = wp.vec3(), wp.vec3()
@@ -332,12 +325,12 @@ def edge_contact(
     first += at[0] * u
     second += at[1] * v
     dist = wp.dot(second - first, axis)
-    return add_contact(out, place, 0, dist, a.pos + a.rot * (0.5 * (first + second)), a.rot * axis)
+    return add_contact(PairContacts(), dist, a.pos + a.rot * (0.5 * (first + second)), a.rot * axis)
 
 
 @wp.func
-def box_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
-    """Write the contacts of two boxes: of a face, or of two edges, where they are least in each other."""
+def box_box(a: Shape, b: Shape) -> PairContacts:
+    """Return the contacts of two boxes: of a face, or of two edges, where they are least in each other."""
     rot, apart = wp.transpose(a.rot) * b.rot, wp.transpose(a.rot) * (b.pos - a.pos)
     slack = SLACK * (a.size[0] + a.size[1] + a.size[2] + b.size[0] + b.size[1] + b.size[2])
     face, chosen = int(0), int(0)
@@ -349,7 +342,7 @@ def box_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
             reach = wp.dot(a.size, wp.abs(axis)) + wp.dot(b.size, wp.abs(wp.transpose(rot) * axis))
             dist = wp.abs(wp.dot(axis, apart)) - reach
             if dist > slack:
-                return int(0)
+                return PairContacts()
             if number < 6 and dist > best:
                 face = number
                 of_face = dist
@@ -361,8 +354,8 @@ def box_box(a: Shape, b: Shape, out: PairContacts, place: int) -> int:
     is_like_face = wp.abs(wp.dot(axis, separating_axis(face, rot))) > LIKE_FACE
     if chosen < 6 or (is_like_face and best < of_face + BETTER * wp.abs(of_face)):
         if face < 3:
-            return face_contacts(a, b, face, 1.0, out, place)
-        return face_contacts(b, a, face - 3, -1.0, out, place)
+            return face_contacts(a, b, face, 1.0)
+        return face_contacts(b, a, face - 3, -1.0)
     if wp.dot(axis, apart) < 0.0:
         axis = -axis
-    return edge_contact(a, b, (chosen - 6) // 3, (chosen - 6) % 3, axis, rot, apart, out, place)
+    return edge_contact(a, b, (chosen - 6) // 3, (chosen - 6) % 3, axis, rot, apart)

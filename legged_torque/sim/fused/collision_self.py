@@ -9,9 +9,9 @@ import warp as wp
 
 from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
 from legged_torque.sim.fused.collision_primitive import (
-    MAX_PAIR_CONTACTS,
     PairContacts,
     Shape,
+    axis_of,
     box_box,
     capsule_box,
     capsule_capsule,
@@ -20,14 +20,19 @@ from legged_torque.sim.fused.collision_primitive import (
     sphere_sphere,
 )
 from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
-from legged_torque.sim.fused.math import group_sum, sum_before
+from legged_torque.sim.fused.math import group_sum, lowest_bit, quat_to_matrix, sum_before, sync_group
 from legged_torque.sim.fused.model import Model, of_world
+from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.tree import Tree
 from legged_torque.sim.fused.types import vec4, vec5
 from legged_torque.utils.mjcf import self_pairs
 
 MAX_SELF_CONTACTS = wp.constant(24)
 """Most contacts of a world between parts of its robot. Further ones are dropped and reported in ``overflow``."""
+AT_ONCE = wp.constant(8)
+"""Pairs whose spheres a thread reads at once."""
+WORD = wp.constant(32)
+"""Pairs that a thread looks at before all threads of its world say what they have found: bits of a number."""
 SPHERE = wp.constant(2)
 """MuJoCo's mjGEOM_SPHERE."""
 OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
@@ -53,8 +58,6 @@ class SelfContacts:
     sphere: wp.array2d(dtype=vec4)  # (geom, world): position from there, and the radius of a sphere around the geom
     x_axis: wp.array2d(dtype=vec4)  # of the geom, with a 0 behind, so that it is read at once
     z_axis: wp.array2d(dtype=vec4)
-    of_pair: PairContacts  # of the pair that each thread collides
-    number: wp.array(dtype=wp.int32)  # of near pairs of each world
     near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, those of each thread in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
@@ -89,10 +92,8 @@ def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
     return tuple(sorted({(int(a), int(b)) for a, b in model.geom_type[ordered_pairs(model)]}))
 
 
-def make_self_contacts(
-    model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data, threads: int
-) -> SelfContacts:
-    """Return the pairs of a robot and room for their contacts, on the current device, for so many threads per world."""
+def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
+    """Return the pairs of a robot and room for their contacts, on the current device."""
     (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
     out, pairs = SelfContacts(), ordered_pairs(model)
     out.pair = wp.array(pairs, dtype=wp.vec2i)
@@ -110,10 +111,6 @@ def make_self_contacts(
     out.geom_start = wp.array(np.searchsorted(owners, range(branches + 1)), dtype=wp.int32)
     out.lin_vel, out.ang_vel = (wp.empty((branches, depth + 1, worlds), dtype=wp.vec3) for _ in range(2))
     out.sphere, out.x_axis, out.z_axis = (wp.empty((model.ngeom, worlds), dtype=vec4) for _ in range(3))
-    out.of_pair = PairContacts()
-    for name, dtype in (("dist", wp.float32), ("pos", wp.vec3), ("normal", wp.vec3)):
-        setattr(out.of_pair, name, wp.empty((MAX_PAIR_CONTACTS, worlds * threads), dtype=dtype))
-    out.number = wp.empty(worlds, dtype=wp.int32)
     out.near = wp.empty((len(pairs), worlds), dtype=wp.int32)
     room = worlds * MAX_SELF_CONTACTS
     out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
@@ -132,6 +129,94 @@ def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape
     x_axis, z_axis = wp.vec3(x[0], x[1], x[2]), wp.vec3(z[0], z[1], z[2])
     rot = wp.matrix_from_cols(x_axis, wp.cross(z_axis, x_axis), z_axis)
     return Shape(wp.vec3(sphere[0], sphere[1], sphere[2]), rot, of_world(model.geom_size, world, geom))
+
+
+@wp.func
+def reach_of(model: Model, world: int, geom: int) -> float:
+    """Return the radius of a sphere around a geom [m]."""
+    size = of_world(model.geom_size, world, geom)
+    reach = size[0]
+    if model.geom_type[geom] == CAPSULE:
+        reach = size[0] + size[1]
+    if model.geom_type[geom] == BOX:
+        reach = wp.length(size)
+    return reach
+
+
+@wp.func
+def write_parts(model: Model, selves: SelfContacts, world: int, b: int, poses: Poses):
+    """Write where the geoms of a branch are, and how its bodies move, for the other threads of its world."""
+    for d in range(poses.shape[0]):
+        selves.lin_vel[b, d, world] = poses[d].lin_vel
+        selves.ang_vel[b, d, world] = poses[d].ang_vel
+    for i in range(selves.geom_start[b], selves.geom_start[b + 1]):
+        geom = selves.geom[i]
+        pose = poses[selves.geom_place[geom][1]]
+        pos = pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
+        rot = pose.rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
+        selves.sphere[geom, world] = vec4(pos[0], pos[1], pos[2], reach_of(model, world, geom))
+        selves.x_axis[geom, world] = vec4(rot[0, 0], rot[1, 0], rot[2, 0], 0.0)
+        selves.z_axis[geom, world] = vec4(rot[0, 2], rot[1, 2], rot[2, 2], 0.0)
+
+
+@wp.func
+def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether spheres around two geoms overlap."""
+    first, second = selves.sphere[geoms[0], world], selves.sphere[geoms[1], world]
+    apart = wp.vec3(second[0] - first[0], second[1] - first[1], second[2] - first[2])
+    reach = first[3] + second[3]
+    return wp.length_sq(apart) <= reach * reach
+
+
+@wp.func
+def is_beside(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether a sphere or capsule lies beyond one of the faces of a box; False for other pairs.
+
+    A sphere counts as a capsule, which is longer if the file gives it a second size.
+    """
+    beside = bool(False)
+    if model.geom_type[geoms[1]] == BOX and model.geom_type[geoms[0]] != BOX:
+        shape, box = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+        apart, axis = wp.transpose(box.rot) * (shape.pos - box.pos), wp.transpose(box.rot) * axis_of(shape)
+        outside = wp.abs(apart) - wp.abs(axis) - box.size
+        beside = wp.max(outside) > shape.size[0]
+    return beside
+
+
+@wp.func
+def write_near(model: Model, selves: SelfContacts, world: int, thread: int, threads: int) -> int:
+    """Write the pairs of a world that may touch, those of each thread in order, and return their number.
+
+    Few are near. Threads collect these before they look closer, or they would wait for each other at every pair.
+    """
+    end = int(0)
+    for word in range(0, selves.pair.shape[0], WORD * threads):
+        start = word + thread
+        near, may_touch = int(0), int(0)  # a bit for each pair of this thread
+        k = int(0)
+        while k < WORD:
+            for i in range(AT_ONCE):
+                pair = start + (k + i) * threads
+                if pair < selves.pair.shape[0]:
+                    near |= wp.where(are_near(selves, world, selves.pair[pair]), 1 << (k + i), 0)
+            k += AT_ONCE
+        number = float(0.0)
+        while near != 0:
+            bit = lowest_bit(near)
+            near ^= 1 << bit
+            if not is_beside(model, selves, world, selves.pair[start + bit * threads]):
+                may_touch |= 1 << bit
+                number += 1.0
+        found = int(group_sum(number, threads))
+        if found > 0:
+            place = end + int(sum_before(number, thread, threads))
+            while may_touch != 0:
+                bit = lowest_bit(may_touch)
+                may_touch ^= 1 << bit
+                selves.near[place, world] = start + bit * threads
+                place += 1
+            end += found
+    return end
 
 
 _COLLIDE: dict[tuple[int, int], wp.Function] = {
@@ -179,9 +264,10 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
         first_contact = world * MAX_SELF_CONTACTS
         last = first_contact + MAX_SELF_CONTACTS
         end = first_contact + 0
-        near = selves.number[world]
+        near = write_near(model, selves, world, thread, wp.static(threads))
+        sync_group(wp.static(threads))
         for start in range(0, near, wp.static(threads)):
-            count, own = int(0), world * wp.static(threads) + thread
+            touch = PairContacts()
             pair, geoms = int(0), wp.vec2i(0, 0)
             if start + thread < near:
                 pair = selves.near[start + thread, world]
@@ -190,17 +276,17 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
                 a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
                 for i in range(wp.static(len(kinds))):
                     if first == wp.static(kinds[i][0]) and second == wp.static(kinds[i][1]):
-                        count = wp.static(_COLLIDE[kinds[i]])(a, b, selves.of_pair, own)
-            new = int(group_sum(float(count), wp.static(threads)))
+                        touch = wp.static(_COLLIDE[kinds[i]])(a, b)
+            new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
-                place = end + int(sum_before(float(count), thread, wp.static(threads)))
-                for i in range(count):
+                place = end + int(sum_before(float(touch.count), thread, wp.static(threads)))
+                for i in range(touch.count):
                     if place + i < last:
-                        dist, pos = selves.of_pair.dist[i, own], selves.of_pair.pos[i, own]
-                        normal = selves.of_pair.normal[i, own]
                         selves.geoms[place + i] = geoms
-                        selves.normal[place + i] = normal
-                        selves.found[place + i] = make_self_contact(model, selves, world, pair, dist, pos, normal)
+                        selves.normal[place + i] = touch.normal[i]
+                        selves.found[place + i] = make_self_contact(
+                            model, selves, world, pair, touch.dist[i], touch.pos[i], touch.normal[i]
+                        )
                 end += new
         if end > last and thread == 0:
             selves.overflow[world] = selves.overflow[world] | OVERFLOW

@@ -1,15 +1,12 @@
 """The engine "fused": one kernel per physics step, for legged robots."""
 
-import contextlib
 from collections.abc import Sequence
-from typing import Any
 
 import mujoco
 import warp as wp
 from torch import Tensor
 
 from legged_torque.sim.engine import HeightMap
-from legged_torque.sim.fused.broadphase import ALL, FAR, NEAR, SortedWorlds, make_broadphase_kernel
 from legged_torque.sim.fused.collision_self import make_self_contacts, pair_kinds
 from legged_torque.sim.fused.constraint import Contact
 from legged_torque.sim.fused.layout import Layout, branches_of
@@ -60,37 +57,15 @@ class FusedEngine(WarpEngine):
             if on_map:
                 scratch.contacts.normal = wp.empty(room * layout.points, dtype=wp.vec3)
             if layout.self_kinds:
-                scratch.selves = make_self_contacts(model, self._model, tree, data, layout.threads)
+                scratch.selves = make_self_contacts(model, self._model, tree, data)
             waiting = room if layout.per_thread > 1 else 1
             scratch.branch = wp.empty(waiting, dtype=branch_types(layout.depth).Branch)
-            self._parts = [(ALL, layout, scratch)]
-            self._sorted = SortedWorlds()
-            if layout.self_kinds:
-                self._sorted.order, self._sorted.number = (wp.empty(n, dtype=wp.int32) for n in (num_envs, 2))
-            if layout.self_kinds and self._wp_device.is_cuda:
-                plain = layout._replace(self_kinds=())
-                without = branches_of(plain).Scratch()
-                without.contacts, without.branch = scratch.contacts, scratch.branch
-                self._parts = [(NEAR, layout, scratch), (FAR, plain, without)]
-                self._beside = wp.Stream(self._wp_device)
 
     def step(self, sense: bool = True) -> None:
-        """Launch one physics step: one kernel, or three if parts of the robot may touch each other."""
-        if self._layout.self_kinds:
-            self._sorted.number.zero_()
-            inputs = [self._struct, self._state, self._scratch.selves, self._sorted, sense]
-            self._launch(make_broadphase_kernel(self._layout, len(self._parts) > 1), inputs)
-        for part, layout, scratch in self._parts:
-            worlds = 0 if part == ALL else self._sorted
-            inputs = [self._struct, self._ground, worlds, self._state, scratch, sense]
-            with wp.ScopedStream(self._beside) if part == NEAR else contextlib.nullcontext():
-                self._launch(make_kernel(layout, self._has_forces, part), inputs)
-        if len(self._parts) > 1:
-            wp.get_stream(self._wp_device).wait_stream(self._beside)
-
-    def _launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        """Launch a kernel with all threads of all worlds."""
-        launch_worlds(kernel, (self.num_envs, self._layout.threads), inputs, self._wp_device, BLOCK_DIM)
+        """Launch one physics step."""
+        kernel, dim = make_kernel(self._layout, self._has_forces), (self.num_envs, self._layout.threads)
+        inputs = [self._struct, self._ground, self._state, self._scratch, sense]
+        launch_worlds(kernel, dim, inputs, self._wp_device, BLOCK_DIM)
 
     def applied_forces(self) -> tuple[Tensor, Tensor]:
         """Return the applied forces; from the first call on, the kernel reads them."""

@@ -75,16 +75,11 @@ def sense_branch(model: Model, state: State, world: int, b: int, branch: AnyBran
 
 
 @wp.func
-def clear_airborne(state: State, world: int, selves: SelfContacts):
-    """Set the sensors of geoms to zero that the ground lets through."""
+def sense_self_contacts(model: Model, state: State, world: int, selves: SelfContacts, touching: Touching):
+    """Add contacts between parts of the robot to the sensors of both geoms, after those with the ground."""
     for k in range(selves.airborne.shape[0]):
         for r in range(4):
             state.sensordata[world, selves.airborne[k] + r] = 0.0
-
-
-@wp.func
-def sense_self_contacts(model: Model, state: State, world: int, selves: SelfContacts, touching: Touching):
-    """Add contacts between parts of the robot to the sensors of both geoms, after those with the ground."""
     for k in range(touching.first, touching.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         for side in range(2):

@@ -10,17 +10,11 @@ import functools
 import warp as wp
 
 from legged_torque.sim.fused import constraint_self, solver
-from legged_torque.sim.fused.broadphase import ALL, SortedWorlds, world_of
 from legged_torque.sim.fused.collision import find_contacts, place_plane
 from legged_torque.sim.fused.collision_map import find_map_contacts, place_map
-from legged_torque.sim.fused.collision_self import Touching, self_contact_finder
+from legged_torque.sim.fused.collision_self import Touching, self_contact_finder, write_parts
 from legged_torque.sim.fused.constraint import make_joint_rows
-from legged_torque.sim.fused.integrate import (
-    integrate_branch,
-    integrate_trunk,
-    sense_branch,
-    sense_self_contacts,
-)
+from legged_torque.sim.fused.integrate import integrate_branch, integrate_trunk, sense_branch, sense_self_contacts
 from legged_torque.sim.fused.layout import Layout, branches_of
 from legged_torque.sim.fused.math import sync_group
 from legged_torque.sim.fused.model import Model, State, dof, local_copy
@@ -64,6 +58,7 @@ def branches_maker(layout: Layout, applied_forces: bool) -> wp.Function:
             if j < joints:
                 branch.acc[j] = state.qacc_warmstart[world, dof(model.branch_joint[b, j])]
         if wp.static(own.collide):
+            write_parts(model, scratch.selves, world, b, poses)
             constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.acc)
         return branch
 
@@ -160,15 +155,14 @@ def integrator(layout: Layout) -> wp.Function:
 
 
 @functools.cache
-def make_kernel(layout: Layout, applied_forces: bool, part: int = ALL) -> wp.Kernel:
-    """Return the kernel for a robot's structure, with or without forces that a user applies, and for which worlds."""
+def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
+    """Return the kernel for a robot's structure, with or without forces that a user applies."""
     make_branches = branches_maker(layout, applied_forces)
     make_self_constraints = self_constraint_maker(layout)
     solve = newton_solver(layout)
     integrate = integrator(layout)
     own = branches_of(layout)
     Ground, place_ground = (Surface, place_map) if layout.on_map else (wp.int32, place_plane)
-    Worlds = wp.int32 if part == ALL else SortedWorlds
 
     @wp.kernel(module="unique", enable_backward=False, grid_stride=False, module_options={"fast_math": True})
     def fused_step(
@@ -176,8 +170,6 @@ def make_kernel(layout: Layout, applied_forces: bool, part: int = ALL) -> wp.Ker
         # Model:
         model: Model,
         ground: Ground,
-        # Data in:
-        worlds: Worlds,
         # Data, in and out:
         data: State,
         scratch: own.Scratch,
@@ -185,10 +177,6 @@ def make_kernel(layout: Layout, applied_forces: bool, part: int = ALL) -> wp.Ker
     ):
         place, thread = wp.tid()
         world = first_world + place
-        if wp.static(part != ALL):
-            if place >= worlds.number[wp.static(part)]:
-                return
-            world = world_of(worlds, wp.static(part), place)
         state = local_copy(data)
         scratch.contacts = place_ground(model, ground, world, scratch.contacts)
         trunk = make_trunk(model, state, world)
