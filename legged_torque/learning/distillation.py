@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from rsl_rl import algorithms
 from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.modules import HiddenState
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -15,7 +16,9 @@ from legged_torque.envs import task_registry
 from legged_torque.learning.checkpoint import cloned
 from legged_torque.learning.memory import RememberingPolicy
 from legged_torque.learning.protocols import Transition
+from legged_torque.sim.graph import CudaGraph
 from legged_torque.terrain.rough import RoughGround
+from legged_torque.utils import distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
@@ -29,9 +32,13 @@ DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
 class Distillation(algorithms.Distillation):
     """rsl_rl's Distillation as a learner: the student acts, and learns what its teachers would have done.
 
+    A gradient step takes some steps in a row of some worlds and runs on the device from end to end, so that it replays
+    as a CUDA graph.
+
     Attributes:
         student: The policy.
         teacher: The :class:`Teachers`, once :meth:`allocate` has loaded them.
+        update_graph: The gradient step.
     """
 
     capturable = False
@@ -41,17 +48,24 @@ class Distillation(algorithms.Distillation):
         """Create the learner of a student in a task, from settings in rsl_rl's layout."""
         settings, num_steps, obs = cfg["distillation"], cfg["num_steps_per_env"], env.get_observations()
         names = ("learning_rate", "num_learning_epochs", "gradient_length", "max_grad_norm", "loss_type")
-        per_update = settings["num_learning_epochs"] * num_steps
-        if per_update % settings["gradient_length"]:
-            raise UserError(
-                f"distillation.gradient_length must divide the {per_update} steps of an update (num_learning_epochs x "
-                f"runner.num_steps_per_env), not be {settings['gradient_length']}"
-            )
+        length, minibatches = settings["gradient_length"], settings["num_mini_batches"]
+        if num_steps % length:
+            raise UserError(f"distillation.gradient_length must divide runner.num_steps_per_env={num_steps}: {length}")
         seen = obs.select(*student.obs_groups)
         storage = RolloutStorage("distillation", env.num_envs, num_steps, seen, [env.num_actions], device)
         chosen = {name: settings[name] for name in names}
         super().__init__(student, Teachers([], env), storage, device=device, multi_gpu_cfg=cfg["multi_gpu"], **chosen)
         self._env, self._task_name, self._files = env, cfg.get("task"), settings["teachers"]
+        self._first_rate, self.annealing_start = settings["learning_rate"], settings["annealing_start"]
+        self.learning_rate = torch.tensor(self._first_rate, device=device)
+        self.optimizer = torch.optim.Adam(student.parameters(), lr=self.learning_rate, fused=True, capturable=True)
+        self.num_mini_batches, self._loss = minibatches, torch.zeros((), device=device)
+        worlds = max(env.num_envs // minibatches, 1)
+        self._worlds = torch.zeros(worlds, dtype=torch.long, device=device)  # of a gradient step
+        self._steps = torch.zeros(length, 1, dtype=torch.long, device=device)
+        self._at_start: tuple[Tensor, ...] = ()  # what the student remembered when the rollout began
+        self._memory: tuple[Tensor, ...] = ()  # what it remembers of the worlds of a gradient step
+        self.update_graph = CudaGraph(self._learn, device, cfg["capture"])
 
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> "Distillation":
@@ -70,7 +84,10 @@ class Distillation(algorithms.Distillation):
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
     def allocate(self) -> None:
-        """Load the teachers; a UserError if there are none, or one does not fit the task."""
+        """Load the teachers; a UserError if there are none, one does not fit the task, or there are too few worlds."""
+        if self.num_mini_batches > self._env.num_envs:
+            given = f"distillation.num_mini_batches is {self.num_mini_batches}"
+            raise UserError(f"{given}, more than the {self._env.num_envs} worlds")
         if not self._files:
             raise UserError(
                 "a student needs teachers: --set 'distillation.teachers=[RUN]' names the run of a trained one"
@@ -79,13 +96,16 @@ class Distillation(algorithms.Distillation):
         members = [Teacher(file, self._env, self._task_name) for file in reversed(self._files)]
         self.teacher = Teachers(members[::-1], self._env)
 
+    @torch.no_grad()
     def act(self, obs: TensorDict) -> Tensor:
         """Return the student's actions with noise, and keep its teachers'. Shape: (num_envs, num_actions)."""
         if not self.teacher.members:
             self.allocate()  # of a training that keeps no run
         seen = obs.select(*self.student.obs_groups)
+        if self.storage.step == 0:
+            self._at_start = self._remembered()
         self.transition.observations, self.transition.privileged_actions = seen, self.teacher(obs)
-        self.transition.actions = self.student(seen, stochastic_output=True).detach()
+        self.transition.actions = self.student(seen, stochastic_output=True)
         return self.transition.actions
 
     def observe(self, transition: Transition) -> None:
@@ -100,10 +120,80 @@ class Distillation(algorithms.Distillation):
         """Return the student."""
         return self.student
 
+    def set_progress(self, iteration: int, num_iterations: int) -> None:
+        """Set the learning rate of an iteration, which falls linearly to 0 after the share ``annealing_start``."""
+        left = min(1.0, (1.0 - iteration / num_iterations) / max(1.0 - self.annealing_start, 1e-9))
+        self.learning_rate.fill_(left * self._first_rate)
+
     def update(self) -> dict[str, float]:
-        """Learn from the rollout, and return the loss "behavior", the learning rate and the noise."""
+        """Learn from the rollout, worlds in random order; return the loss "behavior", the learning rate and the noise.
+
+        The loss is the mean over gradient steps and steps of the rollout. Memory goes on from what it was in acting.
+        """
+        length, count = len(self._steps), len(self._worlds)
+        self._loss.zero_()
+        self._memory = self._memory or tuple(part[:, :count].clone() for part in self._at_start)
+        for _ in range(self.num_learning_epochs):
+            order = torch.randperm(self.storage.num_envs, device=self.device)
+            for worlds in order[: count * self.num_mini_batches].split(count):
+                self._worlds.copy_(worlds)
+                for memory, at_start in zip(self._memory, self._at_start, strict=True):
+                    memory.copy_(at_start[:, worlds])
+                for first in range(0, self.storage.num_transitions_per_env, length):
+                    self._steps.copy_(torch.arange(first, first + length).unsqueeze(1))
+                    self.update_graph()
+        self.storage.clear()
+        loss = self._loss.item() / (
+            self.num_learning_epochs * self.num_mini_batches * self.storage.num_transitions_per_env
+        )
         std = float(self.student.output_std.detach().mean())
-        return super().update() | {"learning_rate": self.learning_rate, "action_std": std}
+        return {"behavior": loss, "learning_rate": self.learning_rate.item(), "action_std": std}
+
+    def _learn(self) -> None:
+        """Take a gradient step on the sum of the losses of some steps of some worlds, and remember what they were."""
+        storage, chosen = self.storage, (self._steps, self._worlds)
+        obs = TensorDict({name: values[chosen] for name, values in storage.observations.items()})
+        actions, memory = self._replay(obs, 1.0 - storage.dones[chosen].float())
+        loss = len(actions) * self.loss_fn(actions, storage.privileged_actions[chosen])
+        self.optimizer.zero_grad()
+        loss.backward()
+        gradients = [value.grad for value in self.student.parameters() if value.grad is not None]
+        if self.is_multi_gpu:
+            distributed.average(gradients)
+        nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._loss += loss.detach()
+        for own, last in zip(self._memory, memory, strict=True):
+            own.copy_(last.detach())
+
+    def _replay(self, obs: TensorDict, goes_on: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """Return mean actions for steps in a row, and what the student remembers after them.
+
+        ``goes_on`` is 0 after the last step of an episode, else 1. Shapes begin with (steps, worlds).
+        """
+        student, memory, outputs = self.student, self._memory, []
+        latent = MLPModel.get_latent(student, obs)
+        if student.is_recurrent:
+            for step, kept in zip(latent.split(1), goes_on, strict=True):
+                output, state = student.rnn.rnn(step, memory if len(memory) > 1 else memory[0])
+                memory = tuple(kept * part for part in _parts(state))
+                outputs.append(output)
+            latent = torch.cat(outputs)
+        return student.distribution.deterministic_output(student.mlp(latent)), memory
+
+    def _remembered(self) -> tuple[Tensor, ...]:
+        """Return what the student remembers of its worlds: a tensor for a GRU, two for an LSTM, else none."""
+        if not self.student.is_recurrent:
+            return ()
+        network, state = self.student.rnn.rnn, self.student.get_hidden_state()
+        if state is None:  # nothing yet
+            shape = (network.num_layers, self.storage.num_envs, network.hidden_size)
+            return tuple(torch.zeros(shape, device=self.device) for _ in range(1 + isinstance(network, nn.LSTM)))
+        return tuple(part.clone() for part in _parts(state))
+
+    def close(self) -> None:
+        """Free the graph of the gradient step."""
+        self.update_graph.reset()
 
     def broadcast_parameters(self) -> None:
         """Give all processes the student of the first one; teachers are the same files."""
@@ -130,6 +220,8 @@ class Distillation(algorithms.Distillation):
             self.student.load_state_dict(state["actor_state_dict"], strict)
         if load_cfg is None:
             self.optimizer.load_state_dict(state["optimizer_state_dict"])
+            self.optimizer.param_groups[0]["lr"] = self.learning_rate
+            self.update_graph.reset()  # the optimizer's tensors are new
         return load_cfg is None or load_cfg.get("iteration", False)
 
     def world_state_dict(self) -> dict[str, Any]:
@@ -141,9 +233,13 @@ class Distillation(algorithms.Distillation):
         """Continue from a :meth:`world_state_dict`."""
         state = tree_map(lambda value: value.to(self.device) if isinstance(value, Tensor) else value, state)
         self.student.reset(hidden_state=state["student"])
-        self.last_hidden_states = (state["student"], None)
         for policy, memory in zip(self.teacher.recurrent(), state["teachers"], strict=True):
             policy.memory = memory
+
+
+def _parts(state: HiddenState) -> tuple[Tensor, ...]:
+    """Return the tensors of a memory: one of a GRU, two of an LSTM."""
+    return state if isinstance(state, tuple) else (state,)
 
 
 class Teacher:

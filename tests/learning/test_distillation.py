@@ -23,7 +23,12 @@ SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_step
 SMALL += ["--set=evaluation.interval=16", "--set=evaluation.num_samples=20"]
 OF_TEACHER = ["--task=a1_position", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
 OF_TEACHER += ["--set=algorithm.num_mini_batches=2", "--max_iterations=1", "--perturbation=low"]
-OF_STUDENT = ["--task=a1_position", "--preset=student", "--set=distillation.gradient_length=4"]
+OF_STUDENT = [
+    "--task=a1_position",
+    "--preset=student",
+    "--set=distillation.gradient_length=4",
+    "--set=distillation.num_mini_batches=2",
+]
 MAP = {"terrain.num_rows": 1, "terrain.num_cols": 4, "terrain.max_init_terrain_level": 0}
 OF_STUDENT += ["--set=distillation.student.rnn_hidden_dim=8", "--set=distillation.student.hidden_dims=[8]"]
 
@@ -53,10 +58,11 @@ def observations():
 
 def make_learner(**settings):
     """A learner in a task of which only the observations are known."""
-    cfg = to_dict(DistillationCfg()) | {"num_learning_epochs": 1, "gradient_length": STEPS, **settings}
+    cfg = to_dict(DistillationCfg()) | {"num_learning_epochs": 1, "num_mini_batches": 1, "gradient_length": STEPS}
+    cfg |= settings
     cfg["student"] |= {"rnn_hidden_dim": 4, "hidden_dims": [3], "rnn_type": settings.pop("rnn_type", "gru")}
     train_cfg = {"distillation": cfg, "num_steps_per_env": STEPS, "obs_groups": {"actor": ["policy"]}}
-    train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None}
+    train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None, "capture": False}
     env = SimpleNamespace(num_envs=WORLDS, num_actions=ACTIONS, device="cpu", get_observations=observations)
     env.terrain = None
     alg = Distillation.construct_algorithm(observations(), env, train_cfg, "cpu")
@@ -102,6 +108,16 @@ def test_gradients_go_back_in_time():
         assert numbers["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
         for parameter, gradient in zip(learned, expected, strict=True):
             torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
+
+
+def test_memory_goes_on_from_one_gradient_step_to_the_next():
+    """Without learning, the loss of parts of the worlds and of the rollout is that of all at once."""
+    torch.manual_seed(0)
+    alg = make_learner(num_mini_batches=WORLDS, gradient_length=STEPS // 4, num_learning_epochs=2)
+    seen, ends = roll_out(alg)
+    loss, _ = by_hand(alg.student, seen, ends, torch.zeros(WORLDS, 4))
+    alg.learning_rate.zero_()
+    assert alg.update()["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
 
 
 def test_memory_goes_on():
@@ -219,7 +235,8 @@ def test_refusals(teacher):
         "--set=distillation.teachers=[nobody]": "unknown run 'nobody'",
         "--set=distillation.teachers=[other.pt]": "'other.pt' is no whole checkpoint",
         "--set=control.action_scale=0.5": "has control.action_scale=",
-        "--set=distillation.gradient_length=3": "gradient_length must divide the 8 steps",
+        "--set=distillation.gradient_length=3": "gradient_length must divide runner.num_steps_per_env=4: 3",
+        "--set=distillation.num_mini_batches=5": "num_mini_batches is 5, more than the 4 worlds",
         "--set=algorithm.learning_rate=1e-4": "is not read by legged_torque.learning.distillation:Distillation",
         "--task=a1_torque": "is of task 'a1_position', not 'a1_torque'",
     }
