@@ -35,7 +35,7 @@ def main() -> None:
     iterations = runner.current_learning_iteration
     out = args.out or path_inside(run.folder, f"exported_{iterations}")
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
-    training |= {"iterations": iterations, "total_steps": int(env.total_steps)}
+    training |= {"iterations": iterations, "total_steps": runner.logger.tot_timesteps}
     difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training, WRITERS.get(args.format))
     print(f"{run.checkpoint}, after {training['total_steps']:,} steps of training:")
     print(f"  exported to {out}: policy.onnx, policy.pt, policy.yaml{f', {args.format}' if args.format else ''}")

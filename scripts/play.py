@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 AGENTS = ("zero", "random")  # what acts without a policy
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
+STEPS = 500
 GRIDS = (1, 4, 9, 16, 25)  # numbers of tiles of a video; more would be unreadable
 
 
@@ -83,8 +84,8 @@ def parse_args() -> argparse.Namespace:
     parser = cli.Parser(__doc__)
     cli.add_task_args(parser)
     parser.set_defaults(seed=1)
-    hint = "control steps, 50 of them a second; default: %(default)s"
-    parser.add_argument("--steps", type=int, default=500, help=hint)
+    hint = f"control steps, 50 of them a second; default: {STEPS}"
+    parser.add_argument("--steps", type=int, help=hint)
     hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
     parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
     cli.add_command_arg(parser)
@@ -106,7 +107,7 @@ def parse_args() -> argparse.Namespace:
     args = parser.parse_args()
     cli.check_args(args, steps=Count, command=list[float], port=Annotated[int, Limits(1, 65535)])
     check_combinations(args)
-    args.grid = args.grid or 1
+    args.grid, args.steps = args.grid or 1, args.steps or STEPS
     if args.num_envs is None:
         args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     if args.video:
@@ -119,8 +120,9 @@ def check_combinations(args: argparse.Namespace) -> None:
     has_viewer = args.viewer != "none"
     if args.grid not in (None, *GRIDS):
         raise UserError(f"--grid must be 1, 4, 9, 16 or 25, not {args.grid}")
-    if args.grid and has_viewer:
-        raise UserError(f"--grid is for videos, which --viewer {args.viewer} does not make")
+    for option in ("grid", "video", "steps"):
+        if getattr(args, option) and has_viewer:
+            raise UserError(f"--{option} is for rolling out: leave it out with --viewer {args.viewer}")
     if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
     if args.agent != "policy" and (args.load_run or args.policy or args.checkpoint is not None or has_viewer):
@@ -157,7 +159,7 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     """Return the run of ``--compare``; a UserError if its robot cannot walk next to that of another run."""
     options = dataclasses.replace(cli.options_of(args), task="", num_envs=1, load_run=args.compare)
-    options.checkpoint = options.experiment_name = None
+    options.policy = options.checkpoint = options.experiment_name = None
     compared = task_registry.load_run(options)
     if compared.env_cfg.asset.file != run.env_cfg.asset.file:
         raise UserError(

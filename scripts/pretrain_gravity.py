@@ -64,7 +64,8 @@ def pretrain(args: argparse.Namespace, options: Options, env_cfg: Any, train_cfg
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    words = cli.option_words(args, "task_file", "task", "log_root", "set")  # all of which choose the policy
+    choosing = ("task_file", "task", "log_root", *cli.CLOCKS, "set")  # all of which choose the policy
+    words = cli.option_words(args, *choosing)
     print(f"Train from it: {cli.script_command('train')} {shlex.join(words)}")
 
 

@@ -94,7 +94,7 @@ def main() -> None:
             if train_cfg.distillation.teachers:
                 env_cfg, train_cfg = settings_of_student(options, train_cfg)
         processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
-    on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu"
+    on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu" and learns_in_parts(train_cfg)
     if on_cores and distributed.use_cores(processes) and options.resume:
         from legged_torque.learning.first_run import use_first_run
 
@@ -124,6 +124,13 @@ def new_settings(options: Options) -> tuple[Any, Any]:
         options.preset = CPU_PRESET
         return task_registry.get_cfgs(options.task, options)
     return env_cfg, train_cfg
+
+
+def learns_in_parts(train_cfg: Any) -> bool:
+    """Return whether processes can train the settings' learner together."""
+    from rsl_rl.utils import resolve_callable
+
+    return hasattr(resolve_callable(train_cfg.algorithm.class_name), "broadcast_parameters")
 
 
 def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:

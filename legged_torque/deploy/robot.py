@@ -2,6 +2,7 @@
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,6 @@ class MujocoRobot:
         spec: The MJCF as it was compiled, with the ground.
         model: The compiled MJCF, with the policy's time step.
         data: Its state.
-        notes: Differences from the training, a line each.
         trunk: Number of the trunk's body.
         position: The trunk's position in the world, a view of the state like the next ones [m]. Shape: (3,).
         quat: The trunk's orientation (w, x, y, z). Shape: (4,).
@@ -59,29 +59,29 @@ class MujocoRobot:
         Raises:
             UserError: If the file cannot be read, or lacks a joint or a motor that the policy needs.
         """
-        self.file, self.notes = Path(xml), list[str]()
+        self.file, self._notes, self._description = Path(xml), list[str](), description
         collided = description["robot"]["self_collisions"]
         with loading(self.file):
             spec = mujoco.MjSpec.from_file(str(self.file))
-            self.notes += drawing_notes(spec)
-            self.origins = ground.place_ground(spec, description, self.notes)
+            self._notes += drawing_notes(spec)
+            self.origins = ground.place_ground(spec, description, self._notes)
             self.model = spec.compile()
             pairs = len(self_pairs(self.model))
             if pairs and not collided:
                 exclude_self_collisions(spec, self.model)
                 self.model = spec.compile()
-                self.notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
+                self._notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
             if collided and not pairs:
-                self.notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
+                self._notes.append("parts of the robot collided with each other in training, those of the MJCF do not")
         self.spec = spec
         self.data = mujoco.MjData(self.model)
         old, step = self.model.opt.timestep, 1.0 / description["timing"]["physics_frequency"]
         if not np.isclose(old, step, rtol=1e-6):
-            self.notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
+            self._notes.append(f"time step: the MJCF has {old:g} s, policy.yaml's {step:g} s is used")
         self.model.opt.timestep = step
         self._step = ground.step if contacts == "training" else mujoco.mj_step
         if self.model.nhfield:
-            self.notes.append(ground.CONTACT_NOTES[contacts])
+            self._notes.append(ground.CONTACT_NOTES[contacts])
         (free,) = np.nonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         if len(free) != 1:
             raise UserError(f"the MJCF must have one free joint, that of the trunk; it has {len(free)}")
@@ -92,9 +92,14 @@ class MujocoRobot:
         self._find_joints(description)
         others = self.model.nu - len(self._motors)
         if others:
-            self.notes.append(f"{others} motors of the MJCF are not driven by the policy and get 0")
+            self._notes.append(f"{others} motors of the MJCF are not driven by the policy and get 0")
         self._find_geoms(description["episode"]["ends_on_contact_of"], collided)
         self.weight = float(self.model.body_mass.sum() * np.linalg.norm(self.model.opt.gravity))
+
+    @property
+    def notes(self) -> list[str]:
+        """Differences from the training as they are now, a line each."""
+        return [*self._notes, *self._joint_notes()]
 
     def addresses(self) -> dict[str, list[Any]]:
         """Return indices into MuJoCo's arrays of the policy's joints and motors, and of geoms that end episodes.
@@ -213,7 +218,7 @@ class MujocoRobot:
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
     def _find_joints(self, description: dict[str, Any]) -> None:
-        """Find the policy's joints by name, and their motors by transmission. Adds notes on differences.
+        """Find the policy's joints by name, and their motors by transmission.
 
         A UserError, which lists all problems, if a joint is missing or has no motor of its own.
         """
@@ -238,16 +243,14 @@ class MujocoRobot:
         self._signs = np.where(cosines < -PARALLEL, -1.0, 1.0)  # of the file's axes, as seen from the policy's
         self._limits = np.sort(joint_limits(model)[ids].T * self._signs, axis=0)  # [rad] about the policy's axes
         self._torque_per_control = self._signs * [torque_per_control(model, motor) for motor in motors]
-        self._compare_joints(description, cosines)
+        self._cosines = cosines
 
-    def _compare_joints(self, description: dict[str, Any], cosines: np.ndarray) -> None:
-        """Add a note on everything that differs from the training, with the joints that it concerns.
-
-        ``cosines`` are those between the axes of the MJCF and the policy's. Shape: (joints,).
-        """
+    def _joint_notes(self) -> Iterator[str]:
+        """Yield a note on everything that differs from the training, with the joints that it concerns."""
+        description, cosines = self._description, self._cosines
         mass, trained_mass = float(self.model.body_mass.sum()), description["robot"]["mass"]
         if not np.isclose(mass, trained_mass, rtol=MASS_TOLERANCE):
-            self.notes.append(f"mass: the MJCF has {mass:.3f} kg, the robot of the training {trained_mass:.3f} kg")
+            yield f"mass: the MJCF has {mass:.3f} kg, the robot of the training {trained_mass:.3f} kg"
         different = defaultdict[str, list[str]](list)
         for i, name in enumerate(description["joint_order"]):
             trained, (low, high) = description["joints"][name], self._limits[:, i]
@@ -270,7 +273,7 @@ class MujocoRobot:
                 note = f"motor limits: the MJCF has {here}, policy.yaml {there}; the tighter ones act"
                 different[note].append(name)
         for note, names in different.items():
-            self.notes.append(f"{note} ({', '.join(names) if len(names) < len(cosines) else 'all joints'})")
+            yield f"{note} ({', '.join(names) if len(names) < len(cosines) else 'all joints'})"
 
     def _find_geoms(self, ends_on_contact_of: list[str], collided: bool) -> None:
         """Find the ground and the geoms whose contact ends an episode: by parts of names, else those of the trunk.
@@ -286,8 +289,8 @@ class MujocoRobot:
         self._is_ending = np.any([np.zeros(model.ngeom, bool), *matching.values()], axis=0)
         missing = ", ".join(part for part, geoms in matching.items() if not geoms.any())
         if missing and self._is_ending.any():
-            self.notes.append(f"no geom's name contains {missing}: it ends no episode")
+            self._notes.append(f"no geom's name contains {missing}: it ends no episode")
         elif missing:
             trunk = model.body(self.trunk).name
-            self.notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
+            self._notes.append(f"no geom's name contains {missing}: those of '{trunk}' end an episode")
             self._is_ending = model.geom_bodyid == self.trunk

@@ -115,8 +115,9 @@ class RayProcess:
             if not name.startswith(f"{self._cell.name}/") and not is_new_policy:
                 del report.files[name]
         write_files(out, report.files)
-        for name in filter(is_checkpoint, report.files):
-            remove_other_worlds(out / name)
+        newest = last_checkpoint(self._cell)
+        if newest and any(map(is_checkpoint, report.files)):
+            remove_other_worlds(newest)
 
 
 def join_cluster(address: str) -> Any:

@@ -74,6 +74,7 @@ class Trainer:
         self.stopped_by = 0
         self.verbose = False
         self._seconds_before = 0.0  # training time before this process
+        self._steps_of_teachers = 0  # which the task has counted, too
         self._saved_iteration = -1
         self._has_old_worlds = False  # whether the worlds are those of a checkpoint
         self._log = TrainingLog(env, logger, cfg)
@@ -104,6 +105,7 @@ class Trainer:
             self.alg.broadcast_parameters()  # type: ignore[attr-defined] # check_learner has seen it
         first, last = self.current_learning_iteration, self.current_learning_iteration + num_learning_iterations
         guard = TrainingGuard(self.env.health)
+        self._steps_of_teachers = int(self.env.total_steps) - self.logger.tot_timesteps
         self._log.start(first, last, self.verbose)
         self.save_checkpoint()  # the viewer shows it while the first iterations run
         notify = self._log.display.notify if distributed.rank() == 0 else lambda text: None
@@ -166,7 +168,8 @@ class Trainer:
 
         After the last of ``ended`` iterations, which is 0 before, it is time in any case.
         """
-        steps, most_steps = int(self.env.total_steps), int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
+        steps = int(self.env.total_steps) - self._steps_of_teachers
+        most_steps = int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
         before = steps - self._log.steps_per_iteration
         chosen = {each: each.due(before, steps) for each in self._evaluators if each.due(before, steps, ended > 0)}
         if self.logger.writer is None or not chosen:

@@ -25,7 +25,7 @@ class Sensor(Buffers):
     """Whether :meth:`measure` has torch's operations only. One that launches kernels of Warp says False."""
 
     def __init__(self, cfg: SensorCfg, state: RobotState) -> None:
-        """Allocate what is kept. A UserError if the rate does not divide that of the control steps."""
+        """Allocate what is kept. A UserError for a rate or delay that control steps cannot have."""
         super().__init__(state.num_envs, state.device)
         self.cfg, self.state = cfg, state
         steps = 1.0 / (cfg.rate * state.dt) if cfg.rate else 1.0
@@ -34,7 +34,10 @@ class Sensor(Buffers):
             raise UserError(
                 f"a sensor's rate must divide that of the control steps, {1 / state.dt:g} Hz, not {cfg.rate:g}"
             )
-        self.delay = round(cfg.delay / state.dt)  # control steps
+        late = cfg.delay / state.dt
+        self.delay = round(late)  # control steps
+        if abs(late - self.delay) > 1e-6 * late:
+            raise UserError(f"a sensor's delay must be whole control steps of {state.dt:g} s, not {cfg.delay:g} s")
         self.has_noise = False  # whether errors are added; the task sets it
         self._kept = self.buffer("kept", self.delay + 1, *self.shape())  # the newest first
         self.newest, self.values = self._kept[:, 0], self._kept[:, -1]

@@ -145,7 +145,7 @@ class TaskRegistry:
         on_cpu = resolve_device(args.device) == "cpu"  # imports torch
         train_cfg.import_code()
         is_given = args.num_envs is not None or any(item.startswith("env.num_envs=") for item in args.set)
-        if on_cpu and run_config is None and not is_given:
+        if on_cpu and not is_given and not (run_config and run_config.get("train")):  # a run keeps its number of worlds
             env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg
 

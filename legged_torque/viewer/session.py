@@ -166,9 +166,9 @@ class Session:
         self.pacer.restart()
 
     def hold(self, command: Command | None) -> None:
-        """Give all worlds a command, or a random one each, from the next step on."""
+        """Give all worlds a command, or those of the training, from the next step on."""
         self.command = command
-        self.task.command_generator.hold(command)
+        self.task.command_generator.hold(command or self.task.cfg.commands.fixed)
         self.task.command_generator.resample(torch.ones_like(self.task.reset_buf))
 
     def _apply_mixing(self) -> None:

@@ -58,6 +58,8 @@ def pretrain(name: str, env_cfg: Any, train_cfg: Any, device: str) -> tuple[MLPM
     """
     cfg, settings = copy.deepcopy(env_cfg), train_cfg.pretraining
     check_settings(settings)
+    if train_cfg.obs_groups.actor != ["policy"]:
+        raise UserError(f"gravity pre-training needs obs_groups.actor=[policy], not {train_cfg.obs_groups.actor}")
     use_standing_trials(cfg, env_cfg.control.decimation)
     with own_random_numbers(device, seeded_state(device, settings.seed)):
         task = task_registry.get_task_class(name)(cfg, device)

@@ -66,12 +66,15 @@ def test_a_file_of_motors_changes_what_it_names(make_task, tmp_path):
     export_random(make_task, "a1_torque", tmp_path / "own", **changes)
     (tmp_path / "same.yaml").write_text("motors: {lag: {time_constant: 0.01}}")
     (tmp_path / "slow.yaml").write_text("motors: {lag: {time_constant: 0.05}}")
+    (tmp_path / "heavy.yaml").write_text("motors: {joints: {armature: 0.02}}")
     found = []
     for words in ([], ["--motors=same.yaml"], ["--motors=slow.yaml"]):
         words = ["own", "--robots=1", "--steps=20", "--json=out.json", *words]
         assert run_here("sim2sim.py", *words, root=tmp_path)[0] == 0
         found.append(json.loads((tmp_path / "out.json").read_text())["metrics"])
     assert found[0] == found[1] != found[2]
+    said = run_here("sim2sim.py", "own", "--robots=1", "--steps=1", "--motors=heavy.yaml", root=tmp_path)[1]
+    assert "armature of joints: the MJCF has 0.02, the robot of the training 0.01 (all joints)" in said
 
 
 def test_jitter_and_loss():

@@ -72,9 +72,9 @@ def test_differences_of_the_scene(policy, changed):
     assert robot.notes == [
         "the MJCF has no floor: a plane at height 0 is added",
         "time step: the MJCF has 0.002 s, policy.yaml's 0.005 s is used",
+        "no geom's name contains trunk: those of 'base' end an episode",
         "motor limits: the MJCF has -20 to 25 N m, policy.yaml -33.5 to 33.5 N m; the tighter ones act "
         "(FR_thigh_joint)",
-        "no geom's name contains trunk: those of 'base' end an episode",
     ]
     assert robot.model.opt.timestep == 0.005
     robot.reset(np.array([0.0, 0.0, 0.04]), STATE[1], policy.nominal_pose, (np.zeros(3), np.zeros(3), np.zeros(12)))

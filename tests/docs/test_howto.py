@@ -112,7 +112,8 @@ def test_parameter(run_page):
 
 
 def test_learner(tmp_path, monkeypatch):
-    """The page's learner trains, resumes and is evaluated by the scripts."""
+    """The page's learner trains in one process where there are two cores, resumes and is evaluated by the scripts."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
     file = tmp_path / "random_search.py"
     file.write_text(python_files("docs/howto/learner.md")[0][1])
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))

@@ -1,6 +1,7 @@
 """Experiments on a Ray cluster of two machines, here two nodes on one, with small stand-ins for the scripts."""
 
 import contextlib
+import io
 import json
 import os
 import shutil
@@ -9,6 +10,7 @@ import threading
 from pathlib import Path
 
 import pytest
+import torch
 from support.experiments import SMALL, experiment_here, order, wait_for, write, write_scripts
 from support.scripts import ROOT, assert_told_in_one_line
 from support.settings import error_of
@@ -17,7 +19,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_node import write_files
+from legged_torque.experiments.ray_node import Report, write_files
 
 FAST = {
     "worker_niceness": 0,  # by default they wait for all other tests
@@ -164,3 +166,15 @@ def test_files_stay_in_their_folder(name, tmp_path):
     folder = tmp_path / "out"
     assert "would be written to" in error_of(write_files, folder, {"good": b"1", name: b"2"})
     assert not list(tmp_path.iterdir())
+
+
+def test_worlds_that_come_home_stay(tmp_path):
+    """Of a report with several checkpoints, the worlds of the newest one are kept, and those before it go."""
+    cell, data = matrix.Cell(tmp_path / "out" / "a-s1", "a1_torque", "low", 1, ()), io.BytesIO()
+    torch.save({}, data)
+    process = ray_launcher.RayProcess(None, None, cell, tmp_path / "log")
+    for names in (("model_50", "worlds_50"), ("model_150", "model_100", "worlds_150"), ("model_120",)):
+        files = {f"a-s1/run_0/{name}.pt": data.getvalue() for name in names}
+        process._take(Report("a machine", files=files))
+    left = {file.stem for file in (cell.folder / "run_0").iterdir()}
+    assert left == {"model_50", "model_100", "model_120", "model_150", "worlds_150"}

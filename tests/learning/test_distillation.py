@@ -225,6 +225,8 @@ def test_curricula_are_those_of_the_first_teacher(teacher):
         (run,) = (root / "logs" / "a1_position").glob(f"*_of{steps}")
         state = checkpoint.read(run / "model_1.pt", "checkpoint", "cpu")
         assert state["infos"]["task"]["total_steps"] == steps + 16
+        rows = (run / "evaluations.csv").read_text().splitlines()
+        assert [row.split(",")[0] for row in rows] == ["steps", "16"]  # its own
 
 
 def test_refusals(teacher):

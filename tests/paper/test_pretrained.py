@@ -138,6 +138,8 @@ def test_settings_that_make_no_sense(tmp_path):
     """They are refused by their names before anything is made, and so is a task without pre-training."""
     result = run_here("pretrain_gravity.py", *SMALL, *words_of(num_configurations=3), root=tmp_path)
     assert_told_in_one_line(result, "pretraining.num_rounds is 4, more than there are configurations")
+    result = run_here("pretrain_gravity.py", *SMALL, "--set=obs_groups.actor=[critic]", root=tmp_path)
+    assert_told_in_one_line(result, "gravity pre-training needs obs_groups.actor=[policy], not ['critic']")
     result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
     assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
     assert not list(tmp_path.iterdir())

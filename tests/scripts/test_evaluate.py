@@ -38,6 +38,7 @@ def test_a_seed_fixes_every_number(root, tmp_path):
     often = "--set=domain_rand.push_probability=0.5"  # or low and high would rarely differ in so few steps
     words = ["--num_envs=3", "--steps=20", "--seed=3", often]
     _, result = evaluate(root, tmp_path / "a.json", *words)
+    assert result["set"] == ["domain_rand.push_probability=0.5"]
     torch.rand(11)
     evaluate(root, tmp_path / "b.json", *words)
     assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()

@@ -156,8 +156,9 @@ def test_state():
 
 
 def test_mistakes():
-    """A rate that does not divide, a group that exists, and mirror images that are not known are refused by name."""
+    """Rates that do not divide, half a step, a group that exists and unknown mirror images are refused by name."""
     assert "a sensor's rate must divide that of the control steps, 50 Hz, not 30" in error_of(make, rate=30.0)
+    assert "a sensor's delay must be whole control steps of 0.02 s, not 0.03 s" in error_of(make, delay=0.03)
     assert "'rays' in 'policy' is not known" in error_of(lambda: make().mirror)
 
     class Taken(RayRobot):

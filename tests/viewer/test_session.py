@@ -92,6 +92,16 @@ def test_command(make_session):
     assert drawn.abs().max() <= 1.0 and len(drawn.unique()) == 3 * NUM_ENVS
 
 
+def test_a_task_with_one_command(make_session):
+    """It is that of the training, unless another is set."""
+    session, _ = make_session(**{"commands.fixed": [0.5, 0.0, -0.25]})
+    ticks(session, 2)
+    np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, -0.25]] * NUM_ENVS)
+    ask(session.set_command, (0.25, 0.0, 0.0), count=2)
+    ask(session.set_command, None, count=2)
+    np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, -0.25]] * NUM_ENVS)
+
+
 @pytest.mark.parametrize(("angle", "expected"), [(0.0, 0.4), (math.pi / 2, 0.4 + math.pi / 2)])
 def test_push(make_session, angle, expected):
     """A push adds a velocity along the trunk's heading, to which it has been turned before it was tilted."""
