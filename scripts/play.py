@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 AGENTS = ("zero", "random")  # what acts without a policy
 NUM_ENVS = {"none": 16, "web": 4, "native": 1}  # default number of worlds, by viewer
-STEPS = 500
+STEPS = 500  # control steps of a roll-out
 GRIDS = (1, 4, 9, 16, 25)  # numbers of tiles of a video; more would be unreadable
 
 
@@ -122,7 +122,7 @@ def check_combinations(args: argparse.Namespace) -> None:
         raise UserError(f"--grid must be 1, 4, 9, 16 or 25, not {args.grid}")
     for option in ("grid", "video", "steps"):
         if getattr(args, option) and has_viewer:
-            raise UserError(f"--{option} is for rolling out: leave it out with --viewer {args.viewer}")
+            raise UserError(f"--{option} is not for --viewer {args.viewer}, which shows robots live")
     if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
         raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
     if args.agent != "policy" and (args.load_run or args.policy or args.checkpoint is not None or has_viewer):

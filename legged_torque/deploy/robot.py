@@ -250,7 +250,7 @@ class MujocoRobot:
         description, cosines = self._description, self._cosines
         mass, trained_mass = float(self.model.body_mass.sum()), description["robot"]["mass"]
         if not np.isclose(mass, trained_mass, rtol=MASS_TOLERANCE):
-            yield f"mass: the MJCF has {mass:.3f} kg, the robot of the training {trained_mass:.3f} kg"
+            yield f"mass: {mass:.3f} kg here, {trained_mass:.3f} kg in the training"
         different = defaultdict[str, list[str]](list)
         for i, name in enumerate(description["joint_order"]):
             trained, (low, high) = description["joints"][name], self._limits[:, i]
@@ -264,7 +264,7 @@ class MujocoRobot:
             for field in ("damping", "armature", "frictionloss"):
                 own = float(getattr(self.model, f"dof_{field}")[self._dofs[i]])
                 if not np.isclose(own, trained[field], rtol=1e-4, atol=1e-9):
-                    note = f"{field} of joints: the MJCF has {own:g}, the robot of the training {trained[field]:g}"
+                    note = f"{field} of joints: {own:g} here, {trained[field]:g} in the training"
                     different[note].append(name)
             weakest, strongest = sorted(self._signs[i] * limit for limit in torque_range(self.model, self._motors[i]))
             limits = description["torque_limits"][name]

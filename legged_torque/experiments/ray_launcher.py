@@ -11,7 +11,7 @@ from legged_torque.experiments.job import LOST
 from legged_torque.experiments.local_launcher import GPU_JOBS, Jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
 from legged_torque.experiments.ray_node import Files, NodeStep, Report, is_checkpoint, versions_here, write_files
-from legged_torque.learning.worlds import remove_other_worlds, worlds_file
+from legged_torque.learning.worlds import remove_older_worlds, worlds_file
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import check_value
 from legged_torque.utils.runs import CONFIG_FILE, PRETRAINED
@@ -115,9 +115,8 @@ class RayProcess:
             if not name.startswith(f"{self._cell.name}/") and not is_new_policy:
                 del report.files[name]
         write_files(out, report.files)
-        newest = last_checkpoint(self._cell)
-        if newest and any(map(is_checkpoint, report.files)):
-            remove_other_worlds(newest)
+        if any(map(is_checkpoint, report.files)) and (newest := last_checkpoint(self._cell)):
+            remove_older_worlds(newest)
 
 
 def join_cluster(address: str) -> Any:

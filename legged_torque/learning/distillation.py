@@ -30,10 +30,10 @@ DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
 
 
 class Distillation(algorithms.Distillation):
-    """rsl_rl's Distillation as a learner: the student acts, and learns what its teachers would have done.
+    """rsl_rl's Distillation with another update: the student acts, and learns what its teachers would have done.
 
-    A gradient step takes some steps in a row of some worlds and runs on the device from end to end, so that it replays
-    as a CUDA graph.
+    Each gradient step learns from a few control steps in a row, in a part of the worlds. It runs on the device from end
+    to end, so that it replays as a CUDA graph.
 
     Attributes:
         student: The policy.
@@ -47,13 +47,11 @@ class Distillation(algorithms.Distillation):
     def __init__(self, student: MLPModel, env: Any, cfg: dict[str, Any], device: str) -> None:
         """Create the learner of a student in a task, from settings in rsl_rl's layout."""
         settings, num_steps, obs = cfg["distillation"], cfg["num_steps_per_env"], env.get_observations()
-        names = ("learning_rate", "num_learning_epochs", "gradient_length", "max_grad_norm", "loss_type")
+        names = ("learning_rate", "num_learning_epochs", "max_grad_norm", "loss_type")
         length, minibatches = settings["gradient_length"], settings["num_mini_batches"]
-        if num_steps % length:
-            raise UserError(f"distillation.gradient_length must divide runner.num_steps_per_env={num_steps}: {length}")
         seen = obs.select(*student.obs_groups)
         storage = RolloutStorage("distillation", env.num_envs, num_steps, seen, [env.num_actions], device)
-        chosen = {name: settings[name] for name in names}
+        chosen = {name: settings[name] for name in names} | {"gradient_length": 1}  # of rsl_rl's update
         super().__init__(student, Teachers([], env), storage, device=device, multi_gpu_cfg=cfg["multi_gpu"], **chosen)
         self._env, self._task_name, self._files = env, cfg.get("task"), settings["teachers"]
         self._first_rate, self.annealing_start = settings["learning_rate"], settings["annealing_start"]
@@ -84,7 +82,11 @@ class Distillation(algorithms.Distillation):
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
     def allocate(self) -> None:
-        """Load the teachers; a UserError if there are none, one does not fit the task, or there are too few worlds."""
+        """Load the teachers; a UserError if none is given, one does not fit, or settings fit no rollout of the task."""
+        steps, length = self.storage.num_transitions_per_env, len(self._steps)
+        if steps % length:
+            given = f"distillation.gradient_length must divide runner.num_steps_per_env, {steps}"
+            raise UserError(f"{given}, not be {length}")
         if self.num_mini_batches > self._env.num_envs:
             given = f"distillation.num_mini_batches is {self.num_mini_batches}"
             raise UserError(f"{given}, more than the {self._env.num_envs} worlds")
@@ -128,7 +130,8 @@ class Distillation(algorithms.Distillation):
     def update(self) -> dict[str, float]:
         """Learn from the rollout, worlds in random order; return the loss "behavior", the learning rate and the noise.
 
-        The loss is the mean over gradient steps and steps of the rollout. Memory goes on from what it was in acting.
+        The loss is the mean over the rollout, in all processes. Each epoch starts from what the student remembered when
+        the rollout began.
         """
         length, count = len(self._steps), len(self._worlds)
         self._loss.zero_()
@@ -140,26 +143,25 @@ class Distillation(algorithms.Distillation):
                 for memory, at_start in zip(self._memory, self._at_start, strict=True):
                     memory.copy_(at_start[:, worlds])
                 for first in range(0, self.storage.num_transitions_per_env, length):
-                    self._steps.copy_(torch.arange(first, first + length).unsqueeze(1))
+                    self._steps.copy_(torch.arange(first, first + length, device=self.device).unsqueeze(1))
                     self.update_graph()
         self.storage.clear()
-        loss = self._loss.item() / (
-            self.num_learning_epochs * self.num_mini_batches * self.storage.num_transitions_per_env
-        )
+        if self.is_multi_gpu:
+            distributed.average([self._loss])
+        learned = self.num_learning_epochs * self.num_mini_batches * self.storage.num_transitions_per_env
         std = float(self.student.output_std.detach().mean())
-        return {"behavior": loss, "learning_rate": self.learning_rate.item(), "action_std": std}
+        return {"behavior": self._loss.item() / learned, "learning_rate": self.learning_rate.item(), "action_std": std}
 
     def _learn(self) -> None:
-        """Take a gradient step on the sum of the losses of some steps of some worlds, and remember what they were."""
+        """Take a gradient step on the losses of some steps of some worlds, summed over time, and keep the memory."""
         storage, chosen = self.storage, (self._steps, self._worlds)
         obs = TensorDict({name: values[chosen] for name, values in storage.observations.items()})
         actions, memory = self._replay(obs, 1.0 - storage.dones[chosen].float())
         loss = len(actions) * self.loss_fn(actions, storage.privileged_actions[chosen])
         self.optimizer.zero_grad()
         loss.backward()
-        gradients = [value.grad for value in self.student.parameters() if value.grad is not None]
         if self.is_multi_gpu:
-            distributed.average(gradients)
+            distributed.average([value.grad for value in self.student.parameters() if value.grad is not None])
         nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
         self.optimizer.step()
         self._loss += loss.detach()
@@ -220,7 +222,7 @@ class Distillation(algorithms.Distillation):
             self.student.load_state_dict(state["actor_state_dict"], strict)
         if load_cfg is None:
             self.optimizer.load_state_dict(state["optimizer_state_dict"])
-            self.optimizer.param_groups[0]["lr"] = self.learning_rate
+            self.optimizer.param_groups[0].update(lr=self.learning_rate, fused=True, capturable=True)
             self.update_graph.reset()  # the optimizer's tensors are new
         return load_cfg is None or load_cfg.get("iteration", False)
 

@@ -15,7 +15,7 @@ from legged_torque.learning.guard import TrainingGuard
 from legged_torque.learning.protocols import Learner, Task, Transition, check_learner
 from legged_torque.learning.random_state import random_state, restore_random_state
 from legged_torque.learning.training_log import TrainingLog
-from legged_torque.learning.worlds import Worlds, remove_other_worlds
+from legged_torque.learning.worlds import Worlds, remove_older_worlds
 from legged_torque.sim.graph import MAX_CAPTURED_STEPS, CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
@@ -74,7 +74,6 @@ class Trainer:
         self.stopped_by = 0
         self.verbose = False
         self._seconds_before = 0.0  # training time before this process
-        self._steps_of_teachers = 0  # which the task has counted, too
         self._saved_iteration = -1
         self._has_old_worlds = False  # whether the worlds are those of a checkpoint
         self._log = TrainingLog(env, logger, cfg)
@@ -89,7 +88,7 @@ class Trainer:
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train, and leave a checkpoint. Ctrl-C ends training after the current iteration, a second one at once.
 
-        A call is one training: at its end ``algorithm.annealing_start`` has made steps small. All processes that train
+        A call is one training: at its end ``annealing_start`` has made steps small. All processes that train
         together end after the same iteration, whichever is asked to stop, or when torchrun is killed. With
         ``init_at_random_ep_len`` episodes start at random lengths and do not all end at once; those of a checkpoint
         go on as they are.
@@ -105,7 +104,6 @@ class Trainer:
             self.alg.broadcast_parameters()  # type: ignore[attr-defined] # check_learner has seen it
         first, last = self.current_learning_iteration, self.current_learning_iteration + num_learning_iterations
         guard = TrainingGuard(self.env.health)
-        self._steps_of_teachers = int(self.env.total_steps) - self.logger.tot_timesteps
         self._log.start(first, last, self.verbose)
         self.save_checkpoint()  # the viewer shows it while the first iterations run
         notify = self._log.display.notify if distributed.rank() == 0 else lambda text: None
@@ -168,9 +166,8 @@ class Trainer:
 
         After the last of ``ended`` iterations, which is 0 before, it is time in any case.
         """
-        steps = int(self.env.total_steps) - self._steps_of_teachers
-        most_steps = int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
-        before = steps - self._log.steps_per_iteration
+        before, most_steps = self.logger.tot_timesteps, int(LAST_SHARE * ended * self.cfg["num_steps_per_env"])
+        steps = before + self._log.steps_per_iteration  # without those of a student's teachers, which its task counts
         chosen = {each: each.due(before, steps) for each in self._evaluators if each.due(before, steps, ended > 0)}
         if self.logger.writer is None or not chosen:
             return {}
@@ -240,7 +237,7 @@ class Trainer:
         state["infos"]["worlds"] = digest = self._worlds.write(file, worlds)
         checkpoint.write(file, state)
         if digest:
-            remove_other_worlds(file)
+            remove_older_worlds(file)
 
     def _announce(self, file: Path) -> None:
         """Note that a checkpoint has been written, and tell others."""

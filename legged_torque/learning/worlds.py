@@ -14,6 +14,7 @@ from legged_torque.utils import distributed
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.policies import sha256
+from legged_torque.utils.runs import checkpoint_number
 
 
 class Worlds:
@@ -87,10 +88,11 @@ def worlds_file(checkpoint_file: Path) -> Path:
     return checkpoint_file.with_name(checkpoint_file.name.replace("model_", "worlds_"))
 
 
-def remove_other_worlds(checkpoint_file: Path) -> None:
-    """Remove the worlds of a run's other checkpoints."""
+def remove_older_worlds(checkpoint_file: Path) -> None:
+    """Remove the worlds of a run's earlier checkpoints; those of a later one may be there before it."""
     for file in checkpoint_file.parent.glob("worlds_*.pt"):
-        if file != worlds_file(checkpoint_file):
+        number = file.stem.removeprefix("worlds_")
+        if number.isdecimal() and int(number) < checkpoint_number(checkpoint_file):
             file.unlink(missing_ok=True)
 
 

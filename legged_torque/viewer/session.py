@@ -65,11 +65,11 @@ class Session:
     is_paused = False
     world = 0  # the followed world
     falls = 0  # in all worlds since the task was built
-    command: Command | None = None  # of all worlds; None if commands are drawn as in training
+    command: Command | None = None  # of all worlds; None: those of the training
     perturbation = AS_LOADED
     chosen_mixing: Sequence[float] | None = None  # weights of action terms that a user has set
     checkpoint = 0  # iterations of the loaded checkpoint
-    trained_steps = 0  # its environment steps
+    trained_steps = 0  # its environment steps, without those of a student's teachers
     checkpoints: tuple[int, ...] = ()  # all of the run
     follows_newest = False  # whether new ones are loaded as soon as they are saved
     chosen = ""  # a bundled policy that a user wants to see next
@@ -148,7 +148,7 @@ class Session:
     def step(self) -> Snapshot:
         """Make one control step."""
         self._obs = self.task.step(self._policy(self._obs))[0]
-        self.task.total_steps.fill_(self.trained_steps)  # curricula stay at the checkpoint's level
+        self.task.total_steps.fill_(self._total_steps)  # curricula stay at the checkpoint's level
         self.snapshot = self.task.snapshot(self.sim_time + self.task.dt, self.world)
         self.history.append(self.snapshot)
         self.sim_time, self.falls = self.snapshot.time, self.falls + self.snapshot.falls
@@ -184,7 +184,7 @@ class Session:
 
     @request
     def set_command(self, command: Command | None) -> None:
-        """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None draws commands as in training."""
+        """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None: those of the training."""
         self.hold(command)
 
     @request
@@ -300,4 +300,5 @@ class Session:
         """Load a checkpoint into the networks and its counters into the task."""
         with torch.no_grad():
             self._runner.load(str(checkpoint_file(self._run.folder, number)), {"actor": True})
-        self.checkpoint, self.trained_steps = number, int(self.task.total_steps)
+        self.checkpoint, self.trained_steps = number, int(self._runner.logger.tot_timesteps)
+        self._total_steps = int(self.task.total_steps)

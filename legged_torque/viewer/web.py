@@ -238,7 +238,7 @@ class Page:
     def _add_command(self) -> None:
         """Add the commanded velocities. Moving a slider ends random commands."""
         gui, session, ranges = self._gui, self._session, self._session.task.cfg.commands.ranges
-        random = gui.add_checkbox("random", True, hint="drawn as in training, for each world")
+        random = gui.add_checkbox("random", True, hint="as in training, for each world")
         limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
         sliders = [
             gui.add_slider(label, low, max(high, low + STEP), STEP, low, hint=hint)

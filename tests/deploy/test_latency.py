@@ -74,7 +74,7 @@ def test_a_file_of_motors_changes_what_it_names(make_task, tmp_path):
         found.append(json.loads((tmp_path / "out.json").read_text())["metrics"])
     assert found[0] == found[1] != found[2]
     said = run_here("sim2sim.py", "own", "--robots=1", "--steps=1", "--motors=heavy.yaml", root=tmp_path)[1]
-    assert "armature of joints: the MJCF has 0.02, the robot of the training 0.01 (all joints)" in said
+    assert "armature of joints: 0.02 here, 0.01 in the training (all joints)" in said
 
 
 def test_jitter_and_loss():

@@ -51,10 +51,10 @@ def test_differences_of_joints(policy, changed):
     ]
     robot = MujocoRobot(changed(*edits, joint("RL_calf_joint", range="-2.6 -1.6")), policy.description)
     assert robot.notes == [
-        "mass: the MJCF has 13.453 kg, the robot of the training 12.453 kg",
+        "mass: 13.453 kg here, 12.453 kg in the training",
         "axes: those of the MJCF are not the policy's (FR_hip_joint)",
-        "damping of joints: the MJCF has 2, the robot of the training 0 (all joints)",
-        "armature of joints: the MJCF has 0.02, the robot of the training 0.01 (RR_calf_joint)",
+        "damping of joints: 2 here, 0 in the training (all joints)",
+        "armature of joints: 0.02 here, 0.01 in the training (RR_calf_joint)",
         "nominal pose: beyond the joint limits of the MJCF, where episodes start instead (RL_calf_joint)",
     ]
 

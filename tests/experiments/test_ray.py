@@ -173,8 +173,8 @@ def test_worlds_that_come_home_stay(tmp_path):
     cell, data = matrix.Cell(tmp_path / "out" / "a-s1", "a1_torque", "low", 1, ()), io.BytesIO()
     torch.save({}, data)
     process = ray_launcher.RayProcess(None, None, cell, tmp_path / "log")
-    for names in (("model_50", "worlds_50"), ("model_150", "model_100", "worlds_150"), ("model_120",)):
+    for names in (("model_50", "worlds_50"), ("model_150", "model_100", "worlds_150"), ("model_120", "worlds_200")):
         files = {f"a-s1/run_0/{name}.pt": data.getvalue() for name in names}
         process._take(Report("a machine", files=files))
     left = {file.stem for file in (cell.folder / "run_0").iterdir()}
-    assert left == {"model_50", "model_100", "model_120", "model_150", "worlds_150"}
+    assert left == {"model_50", "model_100", "model_120", "model_150", "worlds_150", "worlds_200"}

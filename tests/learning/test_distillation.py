@@ -1,5 +1,6 @@
 """Students: gradients through time, memory and episodes, teachers and their worlds, resumed bits, refusals."""
 
+import copy
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from legged_torque.learning.distillation import Distillation, Teachers, shared_o
 from legged_torque.learning.memory import acting
 from legged_torque.learning.protocols import Transition
 from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.options import Options
 
 WORLDS, STEPS, OBS, ACTIONS = 3, 8, 5, 2
 SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_steps_per_env=4"]
@@ -61,6 +63,7 @@ def make_learner(**settings):
     cfg = to_dict(DistillationCfg()) | {"num_learning_epochs": 1, "num_mini_batches": 1, "gradient_length": STEPS}
     cfg |= settings
     cfg["student"] |= {"rnn_hidden_dim": 4, "hidden_dims": [3], "rnn_type": settings.pop("rnn_type", "gru")}
+    cfg["student"]["rnn_num_layers"] = settings.pop("layers", 1)
     train_cfg = {"distillation": cfg, "num_steps_per_env": STEPS, "obs_groups": {"actor": ["policy"]}}
     train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None, "capture": False}
     env = SimpleNamespace(num_envs=WORLDS, num_actions=ACTIONS, device="cpu", get_observations=observations)
@@ -110,14 +113,37 @@ def test_gradients_go_back_in_time():
             torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
 
 
-def test_memory_goes_on_from_one_gradient_step_to_the_next():
-    """Without learning, the loss of parts of the worlds and of the rollout is that of all at once."""
+@pytest.mark.parametrize(("rnn_type", "layers"), [("gru", 1), ("gru", 2), ("lstm", 2), ("none", 1)])
+def test_memory_goes_on_from_one_gradient_step_to_the_next(rnn_type, layers):
+    """Without learning, the loss of parts of the worlds and of the rollout is that of a student which acts in all."""
     torch.manual_seed(0)
-    alg = make_learner(num_mini_batches=WORLDS, gradient_length=STEPS // 4, num_learning_epochs=2)
-    seen, ends = roll_out(alg)
-    loss, _ = by_hand(alg.student, seen, ends, torch.zeros(WORLDS, 4))
+    settings = {"num_mini_batches": WORLDS, "gradient_length": STEPS // 4, "num_learning_epochs": 2}
+    alg = make_learner(**settings, rnn_type=rnn_type, layers=layers)
     alg.learning_rate.zero_()
-    assert alg.update()["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
+    twin = copy.deepcopy(alg.student)
+    for _ in range(2):  # the second rollout begins with a memory
+        losses = []
+        for obs, dones in zip(*roll_out(alg), strict=True):
+            with torch.no_grad():
+                losses.append((twin(obs) - obs["more"]).square().mean())
+            twin.reset(dones)
+        assert alg.update()["behavior"] == pytest.approx(float(sum(losses)) / STEPS, rel=1e-5)
+
+
+def test_the_learning_rate_falls():
+    """After half of a training, linearly to 0."""
+    alg, rates = make_learner(learning_rate=0.01), []
+    for iteration in (0, 5, 6, 9):
+        alg.set_progress(iteration, 10)
+        rates.append(float(alg.learning_rate))
+    assert rates == pytest.approx([0.01, 0.01, 0.008, 0.002])
+
+
+def test_the_worlds_of_a_cpu():
+    """A student has as many there as other trainings, not those of its teacher."""
+    settings = {"env": {"env": {"num_envs": 4096}}, "train": {}}
+    cfg = task_registry.get_cfgs("a1_position", Options(task="a1_position", device="cpu"), settings)[0]
+    assert cfg.env.num_envs == cfg.env.num_envs_cpu < 4096
 
 
 def test_memory_goes_on():
@@ -210,6 +236,7 @@ def test_a_student_from_command_to_simulation(teacher):
     assert "push_robots: true" in (whole / "config.yaml").read_text()  # as the teacher's run
     assert run_here("evaluate.py", f"--load_run={whole}", "--num_envs=2", "--steps=3", root=root)[0] == 0
     assert run_here("export.py", f"--load_run={whole}", "--out=out", root=root)[0] == 0
+    assert "total_steps: 64" in (root / "out" / "policy.yaml").read_text()  # its own
     assert run_here("sim2sim.py", "out", "--robots=1", "--steps=3", root=root)[0] == 0
 
 
@@ -237,7 +264,7 @@ def test_refusals(teacher):
         "--set=distillation.teachers=[nobody]": "unknown run 'nobody'",
         "--set=distillation.teachers=[other.pt]": "'other.pt' is no whole checkpoint",
         "--set=control.action_scale=0.5": "has control.action_scale=",
-        "--set=distillation.gradient_length=3": "gradient_length must divide runner.num_steps_per_env=4: 3",
+        "--set=distillation.gradient_length=3": "gradient_length must divide runner.num_steps_per_env, 4, not be 3",
         "--set=distillation.num_mini_batches=5": "num_mini_batches is 5, more than the 4 worlds",
         "--set=algorithm.learning_rate=1e-4": "is not read by legged_torque.learning.distillation:Distillation",
         "--task=a1_torque": "is of task 'a1_position', not 'a1_torque'",

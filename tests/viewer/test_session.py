@@ -98,6 +98,7 @@ def test_a_task_with_one_command(make_session):
     ticks(session, 2)
     np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, -0.25]] * NUM_ENVS)
     ask(session.set_command, (0.25, 0.0, 0.0), count=2)
+    np.testing.assert_array_equal(session.snapshot.commands, [[0.25, 0.0, 0.0]] * NUM_ENVS)
     ask(session.set_command, None, count=2)
     np.testing.assert_array_equal(session.snapshot.commands, [[0.5, 0.0, -0.25]] * NUM_ENVS)
 

@@ -15,7 +15,7 @@ class DistillationCfg(Section):
     learning_rate: Fraction = 2e-3  # of Adam
     annealing_start: Share = 0.5  # share of the training after which the learning rate falls to 0
     num_learning_epochs: Annotated[int, Limits(1, 1e4)] = 4  # times that each rollout is learned from
-    num_mini_batches: Annotated[int, Limits(1, 1e6)] = 8  # parts of the worlds, of which each takes its gradient steps
+    num_mini_batches: Annotated[int, Limits(1, 1e6)] = 8  # equal parts of the worlds; an epoch leaves out the rest
     gradient_length: Count = 12  # control steps of a gradient step, through which it goes back in time
     max_grad_norm: Positive = 1.0  # gradients are clipped to this norm
     loss_type: Literal["mse", "huber"] = "mse"  # of actions that differ from the teacher's
