@@ -185,10 +185,16 @@ def steps_per_iteration(config: dict[str, Any]) -> int | None:
 
 
 def given_iterations(config: dict[str, Any]) -> int | None:
-    """Return how many iterations a run was told to make; None if they are what its settings say, or unknown."""
-    if "given_iterations" in config:
-        return config["given_iterations"]
-    iterations, steps = config.get("max_iterations"), steps_per_iteration(config)  # of an older run
+    """Return how many iterations a run was told to make; None if they are what its settings say, or unknown.
+
+    A UserError if the file has no number there.
+    """
+    is_new = "given_iterations" in config
+    iterations, steps = config.get("given_iterations" if is_new else "max_iterations"), steps_per_iteration(config)
+    if iterations is not None and not isinstance(iterations, int):
+        raise UserError(f"the run's config.yaml has no number of iterations, but {iterations!r}")
+    if is_new:  # not said by older runs
+        return iterations
     try:
         is_of_settings = 0 <= iterations * steps - config["train"]["runner"]["total_steps"] < steps  # type: ignore[operator]
     except (KeyError, TypeError):

@@ -158,3 +158,13 @@ def test_a_device_is_not_replaced(tmp_path):
     link.symlink_to("/dev/null")
     write_whole(link, b"1")
     assert link.is_symlink() and link.read_bytes() == b"" and Path("/dev/null").is_char_device()
+
+
+def test_given_iterations():
+    """They are a number, or not given; what else a file may say is refused."""
+    settings = {"env": {"env": {"num_envs": 4}}, "train": {"runner": {"num_steps_per_env": 2, "total_steps": 79}}}
+    assert runs.given_iterations({"given_iterations": 7, "max_iterations": 9}) == 7
+    assert runs.given_iterations({"given_iterations": None, "max_iterations": 9}) is None
+    assert [runs.given_iterations({**settings, "max_iterations": number}) for number in (9, 10, 11)] == [9, None, 11]
+    for config in ({"given_iterations": "many"}, {"max_iterations": 2.5}):
+        assert "has no number of iterations" in error_of(runs.given_iterations, config)
