@@ -62,3 +62,19 @@ def test_flashsac(device, tmp_path):
     for values in (whole, *others):
         values.pop("checkpoint.infos.worlds")  # the digest of a file, whose layout differs after loading
     assert [differences(whole, other) for other in others] == [[], [], []]
+
+
+def test_student(device, tmp_path):
+    """A student repeats to the bit: again, without CUDA graphs, and stopped and resumed."""
+    words = ["--task=a1_position", "--num_envs=64", "--set=runner.num_steps_per_env=8", f"--device={device}", *UNSEEN]
+    finish(start(tmp_path / "teacher", *words, "--set=algorithm.num_mini_batches=2", "--max_iterations=1"))
+    (run,) = (tmp_path / "teacher").glob("**/model_1.pt")
+    words += ["--preset=student", "--set=distillation.gradient_length=4", f"--set=distillation.teachers=[{run}]"]
+    graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
+    for name, capture in graphs.items():
+        iterations = f"--max_iterations={2 if name == 'stopped' else 4}"
+        parts.append(start(tmp_path / name, *words, iterations, f"--set=runner.capture={capture}"))
+    finish(*parts)
+    finish(start(tmp_path / "stopped", f"--device={device}", "--resume", "--max_iterations=4"))
+    whole, *others = (content(tmp_path / name) for name in graphs)
+    assert [differences(whole, other) for other in others] == [[], [], []]
