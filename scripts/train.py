@@ -137,7 +137,10 @@ def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
     """Return settings as options change them, with the task of the first teacher's run, and teachers by their files."""
     root, names = experiment_dir(train_cfg, options.log_root), train_cfg.distillation.teachers
     files = [find_checkpoint_of(root, name).resolve() for name in names]
-    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, load_config(files[0].parent) | {"train": {}})
+    config = load_config(files[0].parent) | {"train": {}}
+    if resolve_device(options.device) == "cpu":  # has fewer worlds than a GPU
+        config["env"]["env"].pop("num_envs", None)
+    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, config)
     train_cfg.distillation.teachers = list(map(str, files))
     return env_cfg, train_cfg
 
@@ -180,7 +183,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         raise UserError(f"the run has all of its {counted(done, 'iteration')}; to go on: {further}")
     if is_first:
         if env.device == "cpu":
-            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not (options.max_iterations or options.resume)
+            is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
+            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not is_short
             threads = max(torch.get_num_threads(), distributed.world_size())
             print_notes([LONG_NOTE if is_long else "", busy_cores_note(threads)])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)

@@ -51,7 +51,9 @@ class Distillation(algorithms.Distillation):
         length, minibatches = settings["gradient_length"], settings["num_mini_batches"]
         seen = obs.select(*student.obs_groups)
         storage = RolloutStorage("distillation", env.num_envs, num_steps, seen, [env.num_actions], device)
-        chosen = {name: settings[name] for name in names} | {"gradient_length": 1}  # of rsl_rl's update
+        chosen = {name: settings[name] for name in names} | {
+            "gradient_length": 1
+        }  # of rsl_rl's update, which is not used
         super().__init__(student, Teachers([], env), storage, device=device, multi_gpu_cfg=cfg["multi_gpu"], **chosen)
         self._env, self._task_name, self._files = env, cfg.get("task"), settings["teachers"]
         self._first_rate, self.annealing_start = settings["learning_rate"], settings["annealing_start"]

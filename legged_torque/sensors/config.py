@@ -10,7 +10,7 @@ class SensorCfg(Section):
     """Settings of a sensor. Inherit for one of your own, and override :meth:`build`."""
 
     rate: NotNegative = 0.0  # [Hz] of new measurements; 0: at every control step
-    delay: Annotated[float, Limits(0, 10)] = 0.0  # [s] by which measurements are late
+    delay: Annotated[float, Limits(0, 10)] = 0.0  # [s] by which measurements are late, whole control steps
     noise: NotNegative = 0.0  # largest error, uniform, where ``noise.add_noise`` is on
 
     def build(self, state: Any) -> Any:

@@ -145,7 +145,8 @@ class TaskRegistry:
         on_cpu = resolve_device(args.device) == "cpu"  # imports torch
         train_cfg.import_code()
         is_given = args.num_envs is not None or any(item.startswith("env.num_envs=") for item in args.set)
-        if on_cpu and not is_given and not (run_config and run_config.get("train")):  # a run keeps its number of worlds
+        is_kept = run_config is not None and "num_envs" in run_config["env"].get("env", {})
+        if on_cpu and not is_given and not is_kept:
             env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg
 

@@ -258,8 +258,11 @@ def test_students():
     curves = pd.read_csv(DOCS / "tried.csv.xz").query("run in ('student/teacher', 'student/60M')")
     last = curves[curves["steps"] > 0.82 * curves.groupby("run")["steps"].transform("max")]
     student, teacher = last.groupby("run")["track_percentage"].mean()
-    assert f"tracks {teacher:.2f} in the last 18% of 200 million steps, its blind student {student:.2f} after" in text
-    assert f"or {curves[curves['run'] == 'student/60M']['seconds'].max():.0f} s" in text
+    assert (
+        f"tracks {teacher:.2f} in the last 18% of 200 million steps, its blind student {student:.2f} in those of"
+        in text
+    )
+    assert f"which took {curves[curves['run'] == 'student/60M']['seconds'].max():.0f} s" in text
 
     def less(numbers, policy):
         return 100.0 * (1.0 - numbers[policy] / numbers["teacher"])[trained]
@@ -270,7 +273,9 @@ def test_students():
     assert {f"{crossed[policy].mean():.2f}" for policy in ("student", "teacher")} == {"0.77"} and "cross 0.77," in text
     others = [f"student, 120 million, rate {rate}" for rate in ("1e-3", "3e-3")]
     worst = max(less(numbers, policy).max() for numbers in (tracked, crossed) for policy in others)
-    assert f"lost up to {worst:.1f}% after 120 million" in text
+    assert f"up to {worst:.1f}% were lost after 120 million" in text
+    stones = 1.0 - tracked["student", "stepping_stones"] / tracked["teacher", "stepping_stones"]
+    assert f"On stepping stones, it tracks {100.0 * stones:.0f}% less." in text
 
 
 def test_identified():

@@ -140,10 +140,11 @@ def test_the_learning_rate_falls():
 
 
 def test_the_worlds_of_a_cpu():
-    """A student has as many there as other trainings, not those of its teacher."""
-    settings = {"env": {"env": {"num_envs": 4096}}, "train": {}}
-    cfg = task_registry.get_cfgs("a1_position", Options(task="a1_position", device="cpu"), settings)[0]
-    assert cfg.env.num_envs == cfg.env.num_envs_cpu < 4096
+    """Settings of a run that say no number of worlds, as a teacher's on a CPU, have as many as others there."""
+    for given, expected in (({"num_envs": 4096}, 4096), ({}, 64)):
+        run = {"env": {"env": given}, "train": {}}
+        cfg = task_registry.get_cfgs("a1_position", Options(task="a1_position", device="cpu"), run)[0]
+        assert (cfg.env.num_envs, cfg.env.num_envs_cpu) == (expected, 64)
 
 
 def test_memory_goes_on():

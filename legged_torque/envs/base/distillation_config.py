@@ -1,4 +1,4 @@
-"""Settings of students, with the names of rsl_rl's Distillation."""
+"""Settings of students, with names of rsl_rl's Distillation and PPO."""
 
 from typing import Annotated, Any, Literal
 

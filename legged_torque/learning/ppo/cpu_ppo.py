@@ -70,7 +70,7 @@ def run_network(network: nn.Module, inputs: Tensor) -> Tensor:
 
 
 class _Linear(torch.autograd.Function):
-    """A linear layer by oneDNN, which is twice as fast as MKL on AMD's processors."""
+    """A linear layer by oneDNN, which was twice as fast as MKL on an AMD EPYC."""
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
