@@ -46,19 +46,25 @@ def test_evaluation_changes_nothing(trained):
     assert [name for name in names if not name.startswith("evaluations")] == ["checkpoint.infos.worlds"]
 
 
+def trained_in_four_ways(folder, words, iterations):
+    """What a training leaves: in one go, again, without CUDA graphs, and stopped in the middle and resumed."""
+    graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
+    for name, capture in graphs.items():
+        count = iterations // 2 if name == "stopped" else iterations
+        parts.append(start(folder / name, *words, f"--max_iterations={count}", f"--set=runner.capture={capture}"))
+    finish(*parts)
+    device = next(word for word in words if word.startswith("--device"))
+    finish(start(folder / "stopped", device, "--resume", f"--max_iterations={iterations}"))
+    return [content(folder / name) for name in graphs]
+
+
 def test_flashsac(device, tmp_path):
     """FlashSAC repeats to the bit: again, without CUDA graphs, and stopped and resumed with its replay."""
     words = ["--task=a1_position", "--preset=flashsac", "--num_envs=64", f"--device={device}", *UNSEEN]
     words += ["--set=flashsac.buffer_min_length=512", "--set=flashsac.replay_buffer_size=4096"]
     words += ["--set=flashsac.learning_rate_end=3e-4", "--set=flashsac.save_replay=true"]
     words += ["--set=flashsac.updates_per_step=1"]
-    graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
-    for name, capture in graphs.items():
-        iterations = f"--max_iterations={3 if name == 'stopped' else 6}"
-        parts.append(start(tmp_path / name, *words, iterations, f"--set=runner.capture={capture}"))
-    finish(*parts)
-    finish(start(tmp_path / "stopped", f"--device={device}", "--resume", "--max_iterations=6"))
-    whole, *others = (content(tmp_path / name) for name in graphs)
+    whole, *others = trained_in_four_ways(tmp_path, words, 6)
     for values in (whole, *others):
         values.pop("checkpoint.infos.worlds")  # the digest of a file, whose layout differs after loading
     assert [differences(whole, other) for other in others] == [[], [], []]
@@ -70,11 +76,5 @@ def test_student(device, tmp_path):
     finish(start(tmp_path / "teacher", *words, "--set=algorithm.num_mini_batches=2", "--max_iterations=1"))
     (run,) = (tmp_path / "teacher").glob("**/model_1.pt")
     words += ["--preset=student", "--set=distillation.gradient_length=4", f"--set=distillation.teachers=[{run}]"]
-    graphs, parts = {"whole": "true", "again": "true", "plain": "false", "stopped": "true"}, []
-    for name, capture in graphs.items():
-        iterations = f"--max_iterations={2 if name == 'stopped' else 4}"
-        parts.append(start(tmp_path / name, *words, iterations, f"--set=runner.capture={capture}"))
-    finish(*parts)
-    finish(start(tmp_path / "stopped", f"--device={device}", "--resume", "--max_iterations=4"))
-    whole, *others = (content(tmp_path / name) for name in graphs)
+    whole, *others = trained_in_four_ways(tmp_path, words, 4)
     assert [differences(whole, other) for other in others] == [[], [], []]
