@@ -139,7 +139,8 @@ def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
     files = [find_checkpoint_of(root, name).resolve() for name in names]
     config = load_config(files[0].parent) | {"train": {}}
     if resolve_device(options.device) == "cpu":  # has fewer worlds than a GPU
-        config["env"]["env"].pop("num_envs", None)
+        with contextlib.suppress(KeyError, TypeError):  # of a broken file, of which get_cfgs says what is wrong
+            del config["env"]["env"]["num_envs"]
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, config)
     train_cfg.distillation.teachers = list(map(str, files))
     return env_cfg, train_cfg

@@ -15,7 +15,7 @@ from torch.utils._pytree import tree_map
 from legged_torque.envs import task_registry
 from legged_torque.learning.checkpoint import cloned
 from legged_torque.learning.memory import RememberingPolicy
-from legged_torque.learning.protocols import Transition
+from legged_torque.learning.protocols import Transition, annealed
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils import distributed
@@ -51,9 +51,8 @@ class Distillation(algorithms.Distillation):
         length, minibatches = settings["gradient_length"], settings["num_mini_batches"]
         seen = obs.select(*student.obs_groups)
         storage = RolloutStorage("distillation", env.num_envs, num_steps, seen, [env.num_actions], device)
-        chosen = {name: settings[name] for name in names} | {
-            "gradient_length": 1
-        }  # of rsl_rl's update, which is not used
+        chosen = {name: settings[name] for name in names}
+        chosen["gradient_length"] = 1  # of rsl_rl's update, which is not used
         super().__init__(student, Teachers([], env), storage, device=device, multi_gpu_cfg=cfg["multi_gpu"], **chosen)
         self._env, self._task_name, self._files = env, cfg.get("task"), settings["teachers"]
         self._first_rate, self.annealing_start = settings["learning_rate"], settings["annealing_start"]
@@ -126,8 +125,7 @@ class Distillation(algorithms.Distillation):
 
     def set_progress(self, iteration: int, num_iterations: int) -> None:
         """Set the learning rate of an iteration, which falls linearly to 0 after the share ``annealing_start``."""
-        left = min(1.0, (1.0 - iteration / num_iterations) / max(1.0 - self.annealing_start, 1e-9))
-        self.learning_rate.fill_(left * self._first_rate)
+        self.learning_rate.fill_(annealed(iteration, num_iterations, self.annealing_start) * self._first_rate)
 
     def update(self) -> dict[str, float]:
         """Learn from the rollout, worlds in random order; return the loss "behavior", the learning rate and the noise.
@@ -135,7 +133,8 @@ class Distillation(algorithms.Distillation):
         The loss is the mean over the rollout, in all processes. Each epoch starts from what the student remembered when
         the rollout began.
         """
-        length, count = len(self._steps), len(self._worlds)
+        count, num_steps = len(self._worlds), self.storage.num_transitions_per_env
+        windows = torch.arange(num_steps, device=self.device).unsqueeze(1).split(len(self._steps))
         self._loss.zero_()
         self._memory = self._memory or tuple(part[:, :count].clone() for part in self._at_start)
         for _ in range(self.num_learning_epochs):
@@ -144,13 +143,13 @@ class Distillation(algorithms.Distillation):
                 self._worlds.copy_(worlds)
                 for memory, at_start in zip(self._memory, self._at_start, strict=True):
                     memory.copy_(at_start[:, worlds])
-                for first in range(0, self.storage.num_transitions_per_env, length):
-                    self._steps.copy_(torch.arange(first, first + length, device=self.device).unsqueeze(1))
+                for steps in windows:
+                    self._steps.copy_(steps)
                     self.update_graph()
         self.storage.clear()
         if self.is_multi_gpu:
             distributed.average([self._loss])
-        learned = self.num_learning_epochs * self.num_mini_batches * self.storage.num_transitions_per_env
+        learned = self.num_learning_epochs * self.num_mini_batches * num_steps
         std = float(self.student.output_std.detach().mean())
         return {"behavior": self._loss.item() / learned, "learning_rate": self.learning_rate.item(), "action_std": std}
 

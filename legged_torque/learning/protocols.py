@@ -167,6 +167,11 @@ class Evaluation(Protocol):
         """Return the present levels of the curricula of the training's ground."""
 
 
+def annealed(iteration: int, num_iterations: int, start: float) -> float:
+    """Return 1 until the share ``start`` of a training is over, and from then on what falls linearly to 0."""
+    return min(1.0, (1.0 - iteration / num_iterations) / max(1.0 - start, 1e-9))
+
+
 def check_methods(learner: type) -> None:
     """Raise a UserError if a class lacks methods of a :class:`Learner`."""
     methods = (name for name in [*vars(Learner), *vars(Stateful)] if not name.startswith("_"))

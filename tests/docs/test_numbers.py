@@ -348,6 +348,11 @@ def test_self_collision():
         key = int(worlds), robots
         expected = [none[key], *(times[(*key, commit)] for commit in ("5744e68", "b4d0c40"))]
         assert [f"{us:.0f}" for us in expected] == cells, key
+    both = next(each["rows"] for each in data if "which is reverted, partly" in str(each.get("what")))
+    falling = [row["us"] for row in both if row["worlds"] == 16384 and row["robots"] == "begin to fall"]
+    assert "begin to fall took {1:.0f} instead of {0:.0f} us".format(*falling) in text_of(
+        "performance.md", "With a separate"
+    )
     tried = [times[16384, "standing", "0bfaceb"], times[4096, "fallen", "0bfaceb"]]
     said = "took {:.0f} us for 16384 standing robots, but {:.0f} for 4096 fallen"
     assert said.format(*tried) in text_of("performance.md", "With a separate kernel")

@@ -1,6 +1,7 @@
 """Students: gradients through time, memory and episodes, teachers and their worlds, resumed bits, refusals."""
 
 import copy
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -277,3 +278,8 @@ def test_refusals(teacher):
             words = [*SMALL, *OF_STUDENT, word]
         assert_told_in_one_line(run_here("train.py", *words, root=root), message)
     assert set(Path(root).rglob("*")) == before
+    broken = Path(shutil.copytree(root / "logs" / "a1_position" / name, root / "broken"))
+    for text in ("env: 3", "env: {env: 3}"):
+        (broken / "config.yaml").write_text(f"task: a1_position\n{text}\ntrain: {{}}\n")
+        words = [*SMALL, *OF_STUDENT, f"--set=distillation.teachers=[{broken}]"]
+        assert_told_in_one_line(run_here("train.py", *words, root=root), "'env' is a section with entries")

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_torque.learning.checkpoint import cloned
-from legged_torque.learning.protocols import Transition
+from legged_torque.learning.protocols import Transition, annealed
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, unknown_name
@@ -124,7 +124,7 @@ class TorchPPO(PPO):
         fall linearly to 0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
         """
         self.actor_learns.fill_(float(iteration >= self.warm_up_iterations))
-        left = min(1.0, (1.0 - iteration / num_iterations) / max(1.0 - self.annealing_start, 1e-9))
+        left = annealed(iteration, num_iterations, self.annealing_start)
         self.entropy_weight.fill_(left * self.entropy_coef)
         if self.schedule == "adaptive":
             self.kl_target.fill_(left * self.desired_kl)
