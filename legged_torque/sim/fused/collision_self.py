@@ -66,6 +66,7 @@ class SelfContacts:
     geoms: wp.array(dtype=wp.vec2i)  # of each contact
     normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
     jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
+    pushed: wp.array2d(dtype=wp.vec3)  # (contact, joint): its stiffness times that motion
     joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
     matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
     # Out:
@@ -115,7 +116,7 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     room = worlds * MAX_SELF_CONTACTS
     out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
     out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
-    out.jacobian = wp.empty((room, joints), dtype=wp.vec3)
+    out.jacobian, out.pushed = (wp.empty((room, joints), dtype=wp.vec3) for _ in range(2))
     out.joints = wp.empty((worlds, joints), dtype=wp.float32)
     out.matrix = wp.empty((worlds, model.nv + 1, model.nv), dtype=wp.float32)
     out.overflow = data.overflow

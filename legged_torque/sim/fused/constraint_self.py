@@ -9,7 +9,7 @@ import warp as wp
 
 from legged_torque.sim.fused.collision_self import SelfContacts, Touching
 from legged_torque.sim.fused.constraint import contact_force, contact_stiffness, expected_rows, row_values
-from legged_torque.sim.fused.math import column, group_sum3, inverse_sqrt, sync_group
+from legged_torque.sim.fused.math import column, group_sum, group_sum3, inverse_sqrt, sync_group, with_column
 from legged_torque.sim.fused.model import Model
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
 from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
@@ -93,14 +93,16 @@ def add_to_branch(
     for k in range(touching.first, touching.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
+        jacobian = type(branch.coupling_lin)()
         for j in range(len(branch.acc)):
             if j < joints:
-                motion = selves.jacobian[k, hinge_index(model, b, j)]
-                branch.gradient[j] -= wp.dot(motion, force)
-                pushed = stiffness * motion
-                for i in range(len(branch.acc)):
-                    if i < joints:
-                        branch.factor[i, j] += wp.dot(selves.jacobian[k, hinge_index(model, b, i)], pushed)
+                jacobian = with_column(jacobian, j, selves.jacobian[k, hinge_index(model, b, j)])
+        pushed = stiffness * jacobian
+        branch.gradient -= wp.transpose(jacobian) * force
+        branch.factor += wp.transpose(jacobian) * pushed
+        for j in range(len(branch.acc)):
+            if j < joints:
+                selves.pushed[k, hinge_index(model, b, j)] = column(pushed, j)
     return branch
 
 
@@ -111,18 +113,17 @@ def write_equations(
     """Write a branch's equations into the whole system: its rows, its columns in the trunk's, its right-hand side.
 
     The system has the joints first, then the trunk's translation and rotation; its last row is the right-hand side.
+    Rows end at the diagonal.
     """
     size = selves.matrix.shape[2]
     for j in range(len(branch.acc)):
         if j < joints:
             row = hinge_index(model, b, j)
-            for c in range(size - 6):
-                selves.matrix[world, row, c] = 0.0
-            for k in range(touching.first, touching.end):
-                stiffness = contact_stiffness(selves.found[k], selves.normal[k], selves.pushing[k])
-                pushed = stiffness * selves.jacobian[k, row]
-                for c in range(size - 6):
-                    selves.matrix[world, row, c] = selves.matrix[world, row, c] + wp.dot(pushed, selves.jacobian[k, c])
+            for c in range(row):
+                entry = float(0.0)
+                for k in range(touching.first, touching.end):
+                    entry += wp.dot(selves.pushed[k, row], selves.jacobian[k, c])
+                selves.matrix[world, row, c] = entry
             for i in range(len(branch.acc)):
                 if i < joints:
                     selves.matrix[world, row, hinge_index(model, b, i)] = branch.factor[j, i]
@@ -142,6 +143,54 @@ def coupled_step(model: Model, selves: SelfContacts, world: int, b: int, joints:
 
 
 @wp.func
+def left_over(selves: SelfContacts, world: int, r: int, c: int) -> float:
+    """Return an entry of the whole system less what the columns before it explain.
+
+    It only reads, so that a thread waits for memory once, not for each entry.
+    """
+    rest = selves.matrix[world, r, c]
+    for k in range(c):
+        rest -= selves.matrix[world, r, k] * selves.matrix[world, c, k]
+    return rest
+
+
+@wp.func
+def factor_system(selves: SelfContacts, world: int, thread: int, threads: int):
+    """Write a world's Cholesky factor in place of its whole system, with the inverse of its diagonal.
+
+    Each thread has every so many rows. The right-hand side is one more row.
+    """
+    size = selves.matrix.shape[2]
+    for c in range(size):
+        sync_group(threads)
+        first, pivot = c + thread, float(0.0)
+        rest = float(0.0)
+        if first <= size:
+            rest = left_over(selves, world, first, c)
+        if thread == 0:
+            pivot = rest
+        inverse = inverse_sqrt(wp.max(group_sum(pivot, threads), 1.0e-12))
+        for r in range(first + threads, size + 1, threads):
+            selves.matrix[world, r, c] = inverse * left_over(selves, world, r, c)
+        if first <= size:
+            selves.matrix[world, first, c] = wp.where(thread == 0, inverse, inverse * rest)
+
+
+@wp.func
+def substitute(selves: SelfContacts, world: int, thread: int, threads: int):
+    """Write the solution of the whole system in place of its right-hand side, after its factorization."""
+    size = selves.matrix.shape[2]
+    for reverse in range(size):
+        c = size - 1 - reverse
+        known = float(0.0)
+        for r in range(size - 1 - thread, c, -threads):  # whose solutions this thread has written
+            known += selves.matrix[world, r, c] * selves.matrix[world, size, r]
+        x = selves.matrix[world, c, c] * (selves.matrix[world, size, c] - group_sum(known, threads))
+        if reverse % threads == thread:
+            selves.matrix[world, size, c] = x
+
+
+@wp.func
 def solve_system(
     selves: SelfContacts,
     world: int,
@@ -151,10 +200,9 @@ def solve_system(
     residual: TrunkMotion,
     added: TrunkSystem,
 ) -> TrunkMotion:
-    """Solve a world's whole system by its Cholesky factor; return the trunk's step and leave all in the last row.
+    """Solve a world's whole system; return the trunk's step and leave all in the last row.
 
-    ``added`` is what the branches add to the trunk's equations. Each thread has every so many rows. The diagonal
-    keeps the pivots, which are squares of the factor's.
+    ``added`` is what the branches add to the trunk's equations.
     """
     size = selves.matrix.shape[2]
     lin = group_sum3(added.rhs_lin, threads) - residual.lin
@@ -167,26 +215,9 @@ def solve_system(
         for i in range(3):
             selves.matrix[world, size, size - 6 + i] = lin[i]
             selves.matrix[world, size, size - 3 + i] = ang[i]
-    for c in range(size):
-        sync_group(threads)
-        inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
-        for r in range(c + 1 + thread, size + 1, threads):
-            selves.matrix[world, r, c] = inverse * selves.matrix[world, r, c]
-        sync_group(threads)
-        for r in range(c + 1 + thread, size + 1, threads):
-            scaled = selves.matrix[world, r, c]
-            for q in range(c + 1, wp.min(r + 1, size)):
-                selves.matrix[world, r, q] = selves.matrix[world, r, q] - scaled * selves.matrix[world, q, c]
-    for reverse in range(size):
-        c = size - 1 - reverse
-        sync_group(threads)
-        inverse = inverse_sqrt(wp.max(selves.matrix[world, c, c], 1.0e-12))
-        x = inverse * selves.matrix[world, size, c]
-        sync_group(threads)
-        for r in range(thread, c, threads):
-            selves.matrix[world, size, r] = selves.matrix[world, size, r] - x * selves.matrix[world, c, r]
-        if thread == 0:
-            selves.matrix[world, size, c] = x
+    factor_system(selves, world, thread, threads)
+    sync_group(threads)
+    substitute(selves, world, thread, threads)
     sync_group(threads)
     step = TrunkMotion()
     for r in range(3):
