@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
+import math
 import os
 import shlex
 import sys
@@ -165,6 +166,9 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
         raise UserError(
             f"--compare needs runs of one robot, not {run.env_cfg.asset.file} and {compared.env_cfg.asset.file}"
         )
+    rates = [1.0 / (cfg.sim.dt * cfg.control.decimation) for cfg in (run.env_cfg, compared.env_cfg)]
+    if not math.isclose(*rates):
+        raise UserError("--compare needs runs of one rate, not {:g} and {:g} Hz; see --policy_hz".format(*rates))
     if {run.env_cfg.terrain.mesh_type, compared.env_cfg.terrain.mesh_type} != {"plane"}:
         raise UserError("--compare needs level ground; see --set terrain.mesh_type=plane")
     return compared

@@ -138,7 +138,7 @@ def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
     root, names = experiment_dir(train_cfg, options.log_root), train_cfg.distillation.teachers
     files = [find_checkpoint_of(root, name).resolve() for name in names]
     config = load_config(files[0].parent) | {"train": {}}
-    if resolve_device(options.device) == "cpu":  # has fewer worlds than a GPU
+    if "cpu" in (resolve_device(options.device), config.get("device")):  # which has fewer worlds than a GPU
         with contextlib.suppress(KeyError, TypeError):  # of a broken file, of which get_cfgs says what is wrong
             del config["env"]["env"]["num_envs"]
     env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, config)

@@ -166,8 +166,8 @@ def tasks_of(name: str, cfg: Any, train_cfg: Any) -> list[tuple[str, str, Any, A
 def further_robots() -> Iterator[tuple[str, Any, Any]]:
     """Yield name, settings and training of the robots in ``envs/robots`` but the A1: modules with two such classes.
 
-    A module that cannot be imported is reported, and its robot is missing. A UserError if a module has several
-    settings, of which none is the robot's for certain.
+    A module that cannot be imported, or has several settings, of which none is the robot's for certain, is reported,
+    and its robot is missing.
     """
     for module in pkgutil.iter_modules(robots.__path__):
         if module.name != "a1":
@@ -177,13 +177,13 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
                 settings = [part for part in own if issubclass(part, LeggedRobotCfg)]
                 training = [part for part in own if issubclass(part, LeggedRobotCfgPPO)]
                 LeggedRobotCfg.refuse_mistakes(*settings, *training)
+                for classes in (settings, training) if settings and training else ():
+                    if len(classes) > 1:
+                        names = ", ".join(part.__name__ for part in classes)
+                        raise UserError(f"it must have one class of this kind, not {names}")
             except Exception as error:  # a user's own file may raise anything
                 print(f"Note: the robot '{module.name}' is missing: {type(error).__name__}: {error}", file=sys.stderr)
                 continue
-            for classes in (settings, training) if settings and training else ():
-                if len(classes) > 1:
-                    names = ", ".join(part.__name__ for part in classes)
-                    raise UserError(f"'{module.name}.py' in envs/robots must have one class of this kind, not {names}")
             if settings and training:
                 yield module.name, settings[0], training[0]
 

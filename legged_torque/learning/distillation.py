@@ -24,7 +24,8 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint_of
 
-SAME = ("asset.file", "control.", "init_state.", "normalization.", "sim.dt")
+SAME = ["asset.file", "control.", "init_state.", "motors.drive.", "motors.muscle.", "normalization.", "sim.dt"]
+SAME += ["terrain.measured_points_"]
 """Beginnings of the paths of settings in which a teacher's run must agree: they say what actions and numbers mean."""
 DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
 
@@ -264,12 +265,15 @@ class Teacher:
         the run is of another task, or its actions or observations have another meaning.
         """
         file = find_checkpoint_of(Path(name).parent, name)
-        number = checkpoint_number(file)
-        options = Options(task=task or "", device=env.device, load_run=str(file.parent), checkpoint=number)
+        options = Options(task=task or "", load_run=str(file.parent), checkpoint=checkpoint_number(file))
+        options.device = env.device.partition(":")[0]  # each process has but one GPU
         run = task_registry.load_run(options)
         own, theirs = flat(to_dict(env.cfg)), flat(to_dict(run.env_cfg))
+        same = list(SAME)
+        if "critic" in run.train_cfg.obs_groups.actor:  # which sees random parameters as shares of their ranges
+            same += [f"domain_rand.{name}." for name in env.cfg.random_parameters()]
         for path in sorted(own.keys() | theirs.keys()):
-            if path.startswith(SAME) and own.get(path) != theirs.get(path):
+            if path.startswith(tuple(same)) and own.get(path) != theirs.get(path):
                 raise UserError(f"the teacher '{name}' has {path}={theirs.get(path)}, its student {own.get(path)}")
         self._env, self.cfg = env, run.env_cfg
         self._size = env.observations.policy_size * run.env_cfg.env.history_length

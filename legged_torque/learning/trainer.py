@@ -61,7 +61,7 @@ class Trainer:
         """
         self.env, self.alg, self.cfg, self.logger, self.device = env, alg, cfg, logger, env.device
         env.num_processes = distributed.world_size()
-        check_learner(alg, env, env.num_processes)
+        check_learner(alg, env, env.num_processes if logger.log_dir else 1)  # a policy that is loaded only acts
         if alg.needs_next_obs:
             env.keep_final_observations = True  # type: ignore[attr-defined] # check_learner has seen it
         logger.device = "cpu"  # numbers are read from the device before they are logged

@@ -66,7 +66,7 @@ class TrainingDisplay(Display):
             steps_per_iteration: Of all worlds.
             is_quiet: Whether nothing is shown.
             clock: Returns the time [s].
-            walks_after: Steps of all worlds after which such trainings have walked before; 0 if that is not known.
+            walks_after: Steps of all worlds after which an A1 has walked with these settings; 0 if that is not known.
         """
         super().__init__(UNIT, total, done, stays=True, clock=clock)
         self._walks_after = walks_after
@@ -140,8 +140,10 @@ class TrainingDisplay(Display):
             entries["steps/s"] = f"{speed * self._steps:,.0f}"
             if self._walks_after and max(self._tracking, default=0.0) < WALKING:
                 seconds = (self._walks_after - self._env_steps) / (speed * self._steps)
-                if seconds > 0.0 or self._tracking:  # a resumed training may walk already
-                    entries["walks"] = f"in about {seconds / 60:.0f} min" if seconds > 0.0 else "later than others did"
+                if seconds > 0.0:
+                    entries["an A1 walks"] = f"in about {seconds / 60:.0f} min"
+                elif self._tracking:  # a resumed training may walk already
+                    entries["walks"] = "later than an A1 did"
         entries |= {name: form.format(numbers[key]) for key, (name, form) in _SHOWN.items() if key in numbers}
         if self._tracking:
             entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"

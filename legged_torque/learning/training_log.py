@@ -65,7 +65,9 @@ class TrainingLog:
         ``numbers`` are the learner's; ``measured`` are logged by the names that they have.
         """
         measured = self._env.log.read(self._env.max_episode_length * self._env.dt) | measured
-        if self._logger.writer is None:
+        if self._logger.writer is None:  # rsl_rl counts what it logs
+            self._logger.tot_timesteps += self.steps_per_iteration
+            self._logger.tot_time += sum(times.values())
             return
         if "return" in measured:
             self._logger.rewbuffer.append(measured.pop("return"))

@@ -164,8 +164,8 @@ def draw_only(env_cfg: Any, name: str) -> None:
         rand.push_robots = False  # the sweep pushes
     if name in names and not rand.randomize_parameters:
         rand.randomize_parameters, rand.keep_fixed = True, [other for other in names if other != name]
-        for link in (getattr(env_cfg.motors, key) for key in env_cfg.motors.chain):
-            if hasattr(link, "draws"):
+        for link in (getattr(env_cfg.motors, key, None) for key in env_cfg.motors.chain):
+            if link is not None and hasattr(link, "draws"):
                 link.draws = {}
 
 

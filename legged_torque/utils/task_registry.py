@@ -229,8 +229,14 @@ class TaskRegistry:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
 
         ``env_cfg`` are settings of the task in place of the run's; its critic may see other things, as it is not
-        loaded. A UserError if the checkpoint cannot be read or is of another kind of policy.
+        loaded. A UserError if the checkpoint cannot be read or is of another kind of policy, or if the policy sees
+        random parameters, which it knows as shares of their ranges, with other ranges.
         """
+        if "critic" in run.train_cfg.obs_groups.actor:
+            trained = self.get_cfgs(run.task, Options(device="cpu"), run.config)[0].random_parameters()
+            for name, value in (env_cfg or run.env_cfg).random_parameters().items():
+                if value != trained[name]:
+                    raise UserError(f"the policy sees domain_rand.{name} as shares of {trained[name]}, not of {value}")
         env, _ = self.make_env(run.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, run.task, train_cfg=run.train_cfg, log_root=None)
         runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
@@ -303,7 +309,7 @@ def set_seed(seed: int) -> None:
     """Seed every random number that a training draws; each process has random numbers of its own."""
     import torch
 
-    torch.manual_seed(seed + distributed.rank())
+    torch.manual_seed(seed + 1_000_000 * distributed.rank())  # the next seed has other numbers in every process
 
 
 task_registry = TaskRegistry()  # the registry that scripts use; legged_torque.envs fills it

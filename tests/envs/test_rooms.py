@@ -37,9 +37,11 @@ def test_order_of_the_pose():
 
 
 def test_robot_without_mirrored_legs(make_task):
-    """It can be simulated, but neither learns from mirror images nor has the symmetry term."""
+    """It can be simulated, but neither learns from mirror images nor has terms on pairs of legs."""
     settings = {"asset.mirrored_legs": []}
     assert "rewards.scales.symmetry needs asset.mirrored_legs" in error_of(make_task, "a1_torque", 1, **settings)
+    swing = {**settings, "rewards.scales.symmetry": 0.0, "rewards.scales.single_stance": 0.5}
+    assert "rewards.scales.single_stance needs asset.mirrored_legs" in error_of(make_task, "a1_torque", 1, **swing)
     task = make_task("a1_torque", 1, **settings, **{"rewards.scales.symmetry": 0.0})
     task.step(torch.zeros(1, 12))
     assert "'FR_hip_joint' has no counterpart" in error_of(lambda: task.mirror)

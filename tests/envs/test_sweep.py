@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 from support.scripts import SMALL, assert_told_in_one_line, run_here
+from support.settings import error_of
 
+from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import measure
 from legged_torque.envs.base.sweep import NUM_PARTS, REST, WATCHED, PushSweep, Sweep
 from legged_torque.utils.errors import UserError
@@ -17,8 +19,6 @@ QUICK = {"domain_rand.resampling_probability": 0.2, "env.episode_length_s": 0.3,
 
 def swept(make_task, name, **settings):
     """Worlds that draw one parameter often."""
-    from legged_torque.envs import task_registry
-
     cfg = task_registry.get_cfgs("a1_position")[0]
     cfg.motors.chain = cfg.motors.choices["real"]  # whose voltage is drawn in training
     draw_only(cfg, name)
@@ -39,6 +39,7 @@ def shaking(task):
         ("motor_strength", {"domain_rand.motor_strength": {"scale": [0.5, 1.5]}}, (0.5, 1.5), "strength"),
         ("contact_stiffness", {"domain_rand.contact_stiffness": {"set": [500.0, 2500.0]}}, (500.0, 2500.0), "solref"),
         ("action_delay", {"motors.delay.range": [0, 3]}, (0, 4), "delay"),
+        ("action_delay", {"motors.delay.range": [0, 15], "motors.delay.unit": "milliseconds"}, (0, 4), "delay"),
     ],
 )
 def test_parts(make_task, name, setting, ends, tensor):
@@ -68,12 +69,21 @@ def test_parts(make_task, name, setting, ends, tensor):
     drawn, speed, ended = drawn[1:], speed[1:], ended[1:]  # the first step is not counted
     edges = np.linspace(*ends, (4 if name == "action_delay" else NUM_PARTS) + 1)
     assert parts.edges == pytest.approx(edges.tolist())
+    assert name != "action_delay" or parts.unit == "physics_steps"  # of 5 ms
     assert len(np.unique(drawn)) >= 4 and ended.any()
     member = np.digitize(drawn, edges[1:-1]) if name == "action_delay" else np.digitize(drawn, edges) - 1
     for i, part in enumerate(parts.table()):
         counted = (member == i) & ~ended
         expected = speed[counted].mean() if counted.any() else math.nan
         assert part["metrics"]["speed"]["mean"] == pytest.approx(expected, rel=1e-4, nan_ok=True)
+
+
+def test_links_that_do_not_exist(make_task):
+    """They are left to the task, which refuses them in a line."""
+    cfg = task_registry.get_cfgs("a1_position")[0]
+    cfg.motors.chain = ["delay", "idael"]
+    draw_only(cfg, "motor_strength")
+    assert "unknown motors.chain 'idael'" in error_of(make_task, "a1_position", 1, **{"motors.chain": cfg.motors.chain})
 
 
 def test_pushes(make_task):

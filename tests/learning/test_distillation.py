@@ -258,6 +258,19 @@ def test_curricula_are_those_of_the_first_teacher(teacher):
         assert [row.split(",")[0] for row in rows] == ["steps", "16"]  # its own
 
 
+def test_a_teacher_that_sees_random_parameters(teacher):
+    """It knows them as shares of their ranges: with other ranges neither its student nor who measures it takes it."""
+    root, _ = teacher
+    words = [*SMALL, *OF_TEACHER, "--set=obs_groups.actor=[critic]", "--run_name=critic"]
+    assert run_here("train.py", *words, root=root)[0] == 0
+    (seer,) = (root / "logs" / "a1_position").glob("*critic")
+    student = ["train.py", *SMALL, *OF_STUDENT, f"--set=distillation.teachers=[{seer.name}]", "--max_iterations=1"]
+    measure = ["evaluate.py", "--device=cpu", "--num_envs=4", "--steps=4", f"--load_run={seer}"]
+    for script, told in ((student, "has domain_rand."), (measure, "the policy sees domain_rand.")):
+        assert run_here(*script, root=root)[0] == 0
+        assert_told_in_one_line(run_here(*script, "--ranges=hard", root=root), told)
+
+
 def test_refusals(teacher):
     """No teacher, one that does not exist or is of another task or control, and settings that are not read."""
     root, name = teacher

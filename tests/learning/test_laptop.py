@@ -89,12 +89,19 @@ def test_the_pd_part_fades_in_time(preset):
     assert fading.t_start < fading.t_end <= train_cfg.algorithm.annealing_start * steps
 
 
+def test_evaluations_take_as_long_at_200_hz():
+    """World steps of an evaluation are four times as many as at 50 Hz."""
+    options = Options(device="cpu", preset="laptop")
+    slow, fast = (task_registry.get_cfgs(f"a1_{name}", options)[1] for name in ("position", "multihead_two_rates"))
+    assert fast.evaluation.num_samples == 4 * slow.evaluation.num_samples
+
+
 def test_when_it_walks(capsys):
     """The time until it walks is that of the steps which are left at this speed, as long as it does not walk.
 
     A training that was resumed after these steps is not late before an evaluation says so.
     """
-    clock, shown = Clock(), ["walks in about 3 min", "walks later than others did", "tracking 0.750"]
+    clock, shown = Clock(), ["an A1 walks in about 3 min", "walks later than an A1 did", "tracking 0.750"]
     measured = {"Evaluation/falls_per_minute": 0.0}
     with TrainingDisplay("title", "folder", 1000, 0, 1000, clock=clock, walks_after=250_000) as display:
         for i in range(1, 301):

@@ -149,3 +149,15 @@ def test_what_does_not_fit_is_refused(make_task):
     forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
     message = error_of(make_trainer, TDLearner, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"
+
+
+def test_a_learner_of_one_process(tmp_path, monkeypatch):
+    """It does not train in several, in which it may act; without a log, its steps are counted, too."""
+    trainer = make_trainer(TDLearner)
+    trainer.learn(2)
+    trainer.save(str(tmp_path / "model.pt"))
+    state = torch.load(tmp_path / "model.pt", weights_only=True)
+    assert state["infos"]["total_timesteps"] == 2 * 8 * trainer.env.num_envs and state["infos"]["seconds"] > 0.0
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    make_trainer(TDLearner)
+    assert error_of(make_trainer, TDLearner, tmp_path).startswith("TDLearner trains in one process only")

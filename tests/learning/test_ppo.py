@@ -203,7 +203,7 @@ def test_returns_and_advantages(per_mini_batch):
 )
 def test_settings_that_make_no_sense(settings, message):
     """They are refused by name."""
-    assert message in error_of(make_ppo, **settings)
+    assert message in error_of(lambda: make_ppo(**settings).allocate())
 
 
 def test_statistics_of_samples():

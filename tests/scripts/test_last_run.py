@@ -42,6 +42,15 @@ def test_one_name_of_two_runs(logs):
     assert_told_in_one_line(run_here("evaluate.py", f"--load_run={FIRST}", root=logs.parent), told)
 
 
+def test_two_rates_are_not_compared(logs):
+    """Control steps of another length do not run beside each other."""
+    other = shutil.copytree(logs / "a1_position" / FIRST, logs / "a1_position" / LAST)
+    config = (other / "config.yaml").read_text()
+    (other / "config.yaml").write_text(config.replace("decimation: 4", "decimation: 2"))
+    words = ["--device=cpu", "--viewer=web", f"--load_run=logs/a1_position/{FIRST}", f"--compare={other}"]
+    assert_told_in_one_line(run_here("play.py", *words, root=logs.parent), "runs of one rate, not 50 and 100 Hz")
+
+
 def test_command_that_goes_on(logs):
     """A resume that has nothing left to do names a command that does go on."""
     words = ["--device=cpu", "--resume", "--logger=none", f"--load_run={FIRST}"]

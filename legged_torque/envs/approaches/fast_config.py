@@ -35,8 +35,10 @@ class FastCfgPPO(LeggedRobotCfgPPO):
         gamma, lam = 0.98**0.25, 0.95**0.25
 
     def presets(self) -> dict[str, dict[str, Any]]:
-        """Return those of 50 Hz, with the same discounts per second."""
+        """Return those of 50 Hz, with the same discounts per second and evaluated time."""
         named = super().presets()
-        for algorithm in (changes.get("algorithm", {}) for changes in named.values()):
+        for changes in named.values():
+            algorithm, evaluation = changes.get("algorithm", {}), changes.get("evaluation", {})
             algorithm |= {key: algorithm[key] ** (1 / STEPS) for key in ("gamma", "lam") if key in algorithm}
+            evaluation |= {key: STEPS * evaluation[key] for key in ("num_samples",) if key in evaluation}
         return named

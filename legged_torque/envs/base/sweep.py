@@ -50,7 +50,8 @@ class Sweep:
         self.name, self._values, self._sign = name, drawn.values[:, place], sign
         self.unit, parts = next(each.unit for each in drawn.parameters if each.name == name), NUM_PARTS
         if name in DELAYS:
-            low, high, self.unit = round(low), round(high), getattr(task.cfg, setting.split(".")[0]).delay.unit
+            unit = getattr(task.cfg, setting.split(".")[0]).delay.unit
+            low, high, self.unit = round(low), round(high), unit.replace("milliseconds", "physics_steps")  # as counted
             parts = high - low
         self.edges = [float(f"{edge:.6g}") for edge in torch.linspace(low, high, parts + 1).tolist()]  # of float32
         self._metrics = [WalkingMetrics(task) for _ in range(parts)]

@@ -13,8 +13,9 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for pair in cfg.asset.mirrored_legs:
         if len(pair) != 2:
             raise UserError(f"asset.mirrored_legs must be pairs [right, left], not {pair}")
-    if cfg.rewards.scales.symmetry and not cfg.asset.mirrored_legs:
-        raise UserError("rewards.scales.symmetry needs asset.mirrored_legs: which legs are right and left of a pair")
+    for name in ("symmetry", "single_stance"):
+        if getattr(cfg.rewards.scales, name) and not cfg.asset.mirrored_legs:
+            raise UserError(f"rewards.scales.{name} needs asset.mirrored_legs: which legs are right and left of a pair")
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
     if cfg.terrain.mesh_type == "heightfield":

@@ -67,12 +67,7 @@ class TorchPPO(PPO):
         if symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
-        self.batch_size = storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
-        if self.batch_size < 1:
-            raise UserError(
-                f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
-                f"({storage.num_envs} worlds x {storage.num_transitions_per_env} steps)"
-            )
+        self.batch_size = max(storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches, 1)
         self.learning_rates = (MIN_LEARNING_RATE, max_learning_rate)
         self.learning_rate = torch.tensor(learning_rate, device=self.device)
         self.annealing_start, self._first_rate = annealing_start, learning_rate
@@ -105,6 +100,15 @@ class TorchPPO(PPO):
         return cls(actor, critic, storage, **settings)
 
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
+
+    def allocate(self) -> None:
+        """Raise a UserError if a rollout has fewer samples than minibatches; a policy that only plays needs none."""
+        worlds, steps = self.storage.num_envs, self.storage.num_transitions_per_env
+        if worlds * steps < self.num_mini_batches:
+            raise UserError(
+                f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
+                f"({worlds} worlds x {steps} steps)"
+            )
 
     def observe(self, transition: Transition) -> None:
         """Keep what followed the actions, and compute returns after the last step of a rollout."""
@@ -166,6 +170,7 @@ class TorchPPO(PPO):
             :data:`LOSS_NAMES` over all processes, "learning_rate", "action_std" and "all_skipped", see
             :class:`~legged_torque.learning.protocols.Learner`.
         """
+        self.allocate()  # of a training that keeps no run
         self.losses.zero_()
         before = [tensor.clone() for tensor in self.tensors()]
         for _ in range(self.num_learning_epochs):
