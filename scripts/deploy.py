@@ -12,7 +12,9 @@ Keys: s stand up, p policy, d or space damping, x no torque, arrows, comma and p
 import argparse
 import contextlib
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,11 +35,10 @@ def parse_args() -> argparse.Namespace:
     hint = "network interface of a Unitree Go2, lo for sim_robot.py, sim for a simulated robot in this process, "
     hint += "or sdk for an A1 or Go1 through unitree_legged_sdk"
     parser.add_argument("--interface", required=True, help=hint)
-    parser.add_argument("--domain", type=int, default=0, help="of DDS; Unitree's robots: 0; default: %(default)s")
+    parser.add_argument("--domain", type=int, help="of DDS; Unitree's robots: 0; default: 0")
     hint = "commands per second; default: the largest multiple of the policy's rate up to 500"
     parser.add_argument("--rate", type=float, help=hint)
     cli.add_command_arg(parser, "first", "stand still")
-    parser.set_defaults(command=[0.0, 0.0, 0.0])
     hint = "obey JSON datagrams on a port of this machine, or of one of its addresses; docs/howto/run_on_robot.md"
     parser.add_argument("--udp", metavar="[ADDRESS:]PORT", help=hint)
     hint = "obey a gamepad; default: %(const)s"
@@ -55,6 +56,10 @@ def parse_args() -> argparse.Namespace:
     cli.check_args(args, power=Annotated[int, Limits(1, 10)])
     if args.power and args.interface != "sdk":
         raise UserError("--power is for --interface sdk: it limits unitree_legged_sdk's motors")
+    if args.domain is not None and args.interface in ("sim", "sdk"):
+        raise UserError("--domain is of DDS, which --interface sim and sdk do without")
+    if args.chirp and args.command:
+        raise UserError("--command is for policies: --chirp has sweeps in place of one")
     if args.walk and args.interface not in ("sim", "lo"):
         raise UserError("--walk is for simulated robots (--interface sim or lo): a real one waits for its operator")
     return args
@@ -84,21 +89,27 @@ def main() -> None:
     loop = RealTimeLoop(args.rate, session.tick)
     chirps = [policy] if args.chirp else []
     view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
-    try:
-        with StopRequest(lambda text: None) as stop, loop, contextlib.ExitStack() as devices:
-            for device in (view.live, *operators):
-                devices.enter_context(device)
-            while not stop.requested and time.monotonic() < end and loop.error is None:
-                for operator in operators:
-                    operator.look()
-                if any(each.has_ended for each in (*operators, *chirps)):
-                    break
-                if log:
-                    log.write()
-                view.show()
-                time.sleep(POLL)
-    finally:  # also where nothing can be printed
-        session.close()
+    ended, aside = threading.Event(), ThreadPoolExecutor()
+
+    def tell() -> None:
+        """Write the log and draw the view, in a thread of its own: a disk or a terminal may keep that waiting."""
+        while not ended.wait(POLL):
+            if log:
+                log.write()
+            view.show()
+
+    with StopRequest(lambda text: None) as stop, contextlib.ExitStack() as parts:
+        for part in (view.live, *operators, aside, contextlib.closing(session), loop):  # left in the reverse order
+            parts.enter_context(part)
+        parts.callback(ended.set)
+        telling = aside.submit(tell)
+        while not (stop.requested or time.monotonic() > end or loop.error or telling.done()):
+            for operator in operators:
+                operator.look()
+            if any(each.has_ended for each in (*operators, *chirps)):
+                break
+            time.sleep(POLL)
+    telling.result()
     print("\n".join([view.line(), *(f"stopped: {reason}" for reason in session.stops)]))
     if loop.error is not None:
         raise loop.error
@@ -111,7 +122,7 @@ def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:
     from legged_torque.runtime.operator import Datagrams, Gamepad, Keyboard, Unattended
 
     operators: list[Any] = [Keyboard(controller), *([Unattended(controller)] if args.walk else [])]
-    operators[0].begin_with(args.command)
+    operators[0].begin_with(args.command or [0.0, 0.0, 0.0])
     devices = [(Datagrams, args.udp), (Gamepad, args.gamepad)]
     return operators + [kind(controller, address) for kind, address in devices if address]
 
@@ -144,7 +155,7 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
         raise UserError(
             f"the policy is of the robot '{trained}'; DDS leads to a '{ROBOT}', --interface sdk to A1 and Go1"
         )
-    return Go2Robot(args.interface, args.domain)
+    return Go2Robot(args.interface, args.domain or 0)
 
 
 if __name__ == "__main__":

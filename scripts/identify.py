@@ -69,7 +69,7 @@ def settings_text(names: list[str], values: dict[str, Any], step: float, fields:
     """Return settings of motors as YAML, with a delay of whole physics steps [s]."""
     import yaml
 
-    steps, offset = round(values["delay"][0] / step), float(f"{abs(values['bias']).max():.2g}")
+    steps, offset = max(round(values["delay"][0] / step), 0), float(f"{abs(values['bias']).max():.2g}")
     delay = {"unit": "physics_steps", "range": [steps, steps]}
     if (1e3 * step).is_integer():  # which holds for other physics steps, too
         delay = {"unit": "milliseconds", "range": [round(1e3 * step) * steps] * 2}

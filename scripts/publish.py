@@ -19,7 +19,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.description import DESCRIPTION_FILE, NETWORK_FILE, read
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, printable
 from legged_torque.utils.files import part_of, write_errors, write_whole
 from legged_torque.utils.plain_yaml import Dumper
 from legged_torque.utils.policies import CARD, read_card, sha256, upload
@@ -89,7 +89,7 @@ def main() -> None:
         try:
             card = copy_policy(network, part, policy.description)
             for note in write_page(part, policy, card["policy"]):
-                print(f"  note: {note}")
+                print(printable(f"  note: {note}"))
             metrics = evaluate(simulation, 1 if "metrics" in card else ROBOTS, STEPS, 1, on_step)
             numbers = {name: [round(value.mean, 5), round(value.standard_error, 5)] for name, value in metrics.items()}
             card.setdefault("metrics", {"plain MuJoCo": numbers})

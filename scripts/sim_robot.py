@@ -18,7 +18,7 @@ from legged_torque import resource_path
 from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.interrupt import StopRequest
-from legged_torque.utils.limits import Limits, NotNegative, Positive
+from legged_torque.utils.limits import Limits, NotNegative, Positive, Share, check_value
 from legged_torque.utils.options import simulated_latency
 
 RATE = 500.0  # messages per second, as a Go2
@@ -121,9 +121,10 @@ def with_faults(faults: object, words: list[str], joints: list[str]) -> object:
             getattr(faults, name).append(value)
             continue
         try:
-            setattr(faults, name, type(getattr(faults, name))(float(value)))
+            number = check_value(f"--fault {name}", float(value), NotNegative if name == "delay" else Share)
         except ValueError:
             raise UserError(f"--fault {name} takes a number, not '{value}'") from None
+        setattr(faults, name, type(getattr(faults, name))(number))
     return faults
 
 

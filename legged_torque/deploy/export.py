@@ -109,6 +109,9 @@ def export_policy(
         write_description(part, description)
         if add:
             add(part, model.as_onnx(verbose=False).cpu().eval())
+        others = (*folder.glob("leapp/*.*"), folder / "params/deploy.yaml", folder / "exported/policy.onnx")
+        for file in others if (folder / DESCRIPTION_FILE).is_file() else ():  # an earlier policy in other formats
+            file.unlink(missing_ok=True)
         for file in sorted(part.rglob("*.*"), key=lambda file: file.name == DESCRIPTION_FILE):
             target = folder / file.relative_to(part)
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -271,12 +274,8 @@ def _memory(model: MLPModel) -> dict[str, Any]:
         return {}
     network: Any = model.as_onnx(verbose=False)
     ends = zip(network.input_names[1:], network.output_names[1:], network.get_dummy_inputs()[1:], strict=True)
-    return {
-        "memory": [
-            {"input": given, "output": returned, "layers": len(state), "size": state.shape[2]}
-            for given, returned, state in ends
-        ]
-    }
+    memory = [{"input": i, "output": o, "layers": len(state), "size": state.shape[2]} for i, o, state in ends]
+    return {"memory": memory}
 
 
 def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:

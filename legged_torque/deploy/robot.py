@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,28 @@ MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally h
 PARALLEL = 0.999  # least cosine between axes that count as parallel
 _ABOVE = 100.0  # height from which rays look down on the ground [m]
 _WARNINGS = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+
+
+def joints_and_motors(model: mujoco.MjModel, order: Sequence[str]) -> tuple[list[int], list[int]]:
+    """Return numbers of joints by name, and of their motors by transmission.
+
+    A UserError, which lists all problems, if a joint is missing or has no motor of its own.
+    """
+    hinge_or_slide = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in hinge_or_slide}
+    missing = [name for name in order if name not in names]
+    refuse([str(unknown_name("joint of the policy in the MJCF", name, names)) for name in missing])
+    ids, motors, wrong = [names[name] for name in order], list[int](), defaultdict[str, list[str]](list)
+    for name, joint in zip(order, ids, strict=True):
+        found = motors_of(model, joint)
+        reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
+        if len(found) != 1:
+            wrong[f"each joint of the policy must have one motor in the MJCF, not {len(found)}"].append(name)
+        elif reason:
+            wrong[f"each joint's actuator must be a motor, ctrl its torque; one {reason}"].append(name)
+        motors += found[:1]
+    refuse(list(with_names(wrong)))
+    return ids, motors
 
 
 class MujocoRobot:
@@ -218,25 +240,9 @@ class MujocoRobot:
     # ---- reading the MJCF --------------------------------------------------------------------------------------------
 
     def _find_joints(self, description: dict[str, Any]) -> None:
-        """Find the policy's joints by name, and their motors by transmission.
-
-        A UserError, which lists all problems, if a joint is missing or has no motor of its own.
-        """
+        """Find the policy's joints and their motors; a UserError lists what is missing."""
         model, order = self.model, description["joint_order"]
-        hinge_or_slide = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-        names = {model.joint(i).name: i for i in range(model.njnt) if model.jnt_type[i] in hinge_or_slide}
-        missing = [name for name in order if name not in names]
-        refuse([str(unknown_name("joint of the policy in the MJCF", name, names)) for name in missing])
-        ids, motors, wrong = [names[name] for name in order], list[int](), defaultdict[str, list[str]](list)
-        for name, joint in zip(order, ids, strict=True):
-            found = motors_of(model, joint)
-            reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
-            if len(found) != 1:
-                wrong[f"each joint of the policy must have one motor in the MJCF, not {len(found)}"].append(name)
-            elif reason:
-                wrong[f"each joint's actuator must be a motor, ctrl its torque; one {reason}"].append(name)
-            motors += found[:1]
-        refuse(list(with_names(wrong)))
+        ids, motors = joints_and_motors(model, order)
         axes = [description["joints"][name]["axis"] for name in order]
         cosines = (joint_axes(model)[ids] * axes).sum(axis=1)
         self._qpos, self._dofs, self._motors = model.jnt_qposadr[ids], model.jnt_dofadr[ids], np.array(motors)

@@ -258,6 +258,8 @@ class MotorsCfg(Section):
         }
 
     def describe(self) -> dict[str, dict[str, Any]]:
-        """Return the chain for ``policy.yaml``, as ``MotorChain.describe`` does, but without delays."""
+        """Return the chain as ``MotorChain.describe`` does, but without delays; a UserError names an unknown link."""
+        known = [name for name, value in vars(self).items() if isinstance(value, MotorCfg)]
+        check_names("motors.chain", self.chain, known)
         links = ((name, getattr(self, name)) for name in self.chain)
         return {name: link.describe() for name, link in links if not isinstance(link, (DelayCfg, PerturbationCfg))}

@@ -43,7 +43,7 @@ class Chirp(Policy):
         low, high = np.array([joint.get("range", (-np.inf, np.inf)) for joint in joints]).T
         room = np.minimum(high - self.nominal_pose, self.nominal_pose - low)
         self._amplitude = np.clip(ROOM * room, 0.0, LARGEST)
-        self._speed = SPEED * np.array([joint["max_velocity"] for joint in joints])
+        self._speed = SPEED * np.array([joint.get("max_velocity", 0.0) for joint in joints])
         self._torque = TORQUE * np.abs(self.torque_limits).min(axis=0)
         self.reset()
 

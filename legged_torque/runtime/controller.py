@@ -71,7 +71,7 @@ class Controller:
         refuse([str(unknown_name("joint of the policy on the robot", name, joint_order)) for name in missing])
         others = [name for name in joint_order if name not in policy.joint_order]
         refuse([f"the policy does not know the robot's joint '{name}'" for name in others])
-        if not all("range" in joints[name] and joints[name]["max_velocity"] > 0.0 for name in joint_order):
+        if not all("range" in joints[name] and joints[name].get("max_velocity", 0.0) > 0.0 for name in joint_order):
             raise UserError("policy.yaml lacks ranges of joints, or speeds (asset.max_dof_vel): export the policy anew")
         self._order = np.array([policy.joint_order.index(name) for name in joint_order])  # of the policy's vectors
         ranges = np.array([joints[name]["range"] for name in joint_order], float).T

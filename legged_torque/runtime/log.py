@@ -3,6 +3,7 @@
 import contextlib
 import io
 import struct
+import threading
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ from legged_torque.utils.errors import UserError
 
 try:
     import orjson
-    from mcap.exceptions import EndOfFile, McapError
+    from mcap.exceptions import EndOfFile
     from mcap.records import Channel, McapRecord, Message, Metadata
     from mcap.stream_reader import StreamReader
     from mcap.writer import Writer
@@ -30,7 +31,7 @@ _CHUNK = 2**16  # bytes that are written at a time
 
 
 class Log:
-    """Writes what a controller does; the control loop only keeps ticks by :meth:`add`; :meth:`write` does the work.
+    """Writes what a controller does: the control loop only keeps ticks by :meth:`add`, any other thread writes them.
 
     A log that was not closed can be read too, but for its last 64 KB. A disk that is full does not stop the robot.
 
@@ -50,6 +51,7 @@ class Log:
         except OSError as error:
             raise UserError(f"cannot write the log '{file}': {error.strerror}") from None
         self._controller, self._waiting = controller, deque[tuple[str, float, dict[str, Any]]]()
+        self._lock = threading.Lock()
         self._writer = Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="", library="legged_torque")
         description = controller.policy.description
@@ -73,15 +75,16 @@ class Log:
 
     def write(self) -> None:
         """Write what has been added since the last call."""
-        try:
-            while self._waiting:
-                channel, now, message = self._waiting.popleft()
-                data = orjson.dumps(_doubles(message), option=orjson.OPT_SERIALIZE_NUMPY)
-                if not self.problem:
-                    self._writer.add_message(self._channels[channel], round(now * _NS), data, round(now * _NS))
-            self._file.flush()
-        except OSError as error:
-            self.problem = f"the log ends here: {error.strerror or error}"
+        with self._lock:
+            try:
+                while self._waiting:
+                    channel, now, message = self._waiting.popleft()
+                    data = orjson.dumps(_doubles(message), option=orjson.OPT_SERIALIZE_NUMPY)
+                    if not self.problem:
+                        self._writer.add_message(self._channels[channel], round(now * _NS), data, round(now * _NS))
+                        self._file.flush()
+            except OSError as error:
+                self.problem = f"the log ends here: {error.strerror or error}"
 
     def close(self) -> None:
         """Write the rest, and end the file."""
@@ -107,14 +110,16 @@ class RecordedLog:
     def __init__(self, file: Path) -> None:
         """Open a log; a UserError if it is none."""
         try:
-            self._content = file.read_bytes()
+            self._file, self._content = file, file.read_bytes()
             about = next(each.metadata for each in self._records() if isinstance(each, Metadata) and each.name == ROBOT)
             self.joint_order: list[str] = orjson.loads(about["joint_order"])
             self.sha256, self.task, self.period = about["sha256"], about["task"], float(about["period"])
             self.keeps_time = about.get("keeps_time") != "False"
+            if not 0.0 < self.period < np.inf:
+                raise ValueError(f"its period is {self.period:g} s")
         except OSError as error:
             raise UserError(f"cannot read '{file}': {error.strerror}") from None
-        except (McapError, StopIteration, KeyError, ValueError) as error:
+        except (StopIteration, KeyError, ValueError) as error:
             raise UserError(f"'{file}' is no log of deploy.py: {error or 'it does not say whose'}") from None
 
     def ticks(self) -> Iterator[tuple[float, RobotState | None, MotorCommand, dict[str, Any]]]:
@@ -139,9 +144,12 @@ class RecordedLog:
                 yield record.log_time / _NS, orjson.loads(record.data)
 
     def _records(self) -> Iterator[McapRecord]:
-        """Yield what the file has, up to where it was cut off."""
-        with contextlib.suppress(EndOfFile, struct.error):
-            yield from StreamReader(io.BytesIO(self._content)).records
+        """Yield what the file has, up to where it was cut off; a UserError if it is damaged before that."""
+        try:
+            with contextlib.suppress(EndOfFile, struct.error):
+                yield from StreamReader(io.BytesIO(self._content), validate_crcs=True).records
+        except Exception as error:  # each kind of damage has its own
+            raise UserError(f"'{self._file}' is no log of deploy.py, or damaged: {error}") from None
 
 
 def _doubles(values: dict[str, Any]) -> dict[str, Any]:

@@ -26,7 +26,7 @@ NUMBERS = ("forward", "sideways", "turn")  # of a datagram: v_x, v_y [m/s] and y
 LONGEST, AT_ONCE = 256, 100  # bytes of a datagram, and datagrams of a look
 SILENCE = 1.0  # seconds without datagrams after which the command is 0
 EVENT = struct.Struct("<IhBB")  # of a gamepad: time [ms], value, kind, number of the button or axis
-BUTTON, AXIS = 1, 2  # kinds; with 0x80 they say how things were when the device was opened
+BUTTON, AXIS, NOT_NEW = 1, 2, 0x80  # kinds, and a bit of what is told at first, and again after events were lost
 BUTTONS = {0: Mode.STAND, 1: Mode.DAMPING, 2: Mode.POLICY}
 AXES = {1: 0, 0: 1, 3: 2}  # index in the command by number; values are negative forwards and to the left
 DEAD, FULL = 0.1, 32767  # an axis' zone around its middle, as a share; its largest value
@@ -73,12 +73,15 @@ class Operator(contextlib.AbstractContextManager["Operator"]):
 
 
 class Unattended(Operator):
-    """Has a simulated robot stand up and walk, until a fault."""
+    """Has a simulated robot stand up and walk, until a fault or another operator ends that."""
+
+    _mode = Mode.DAMPING  # the last one that was reached
 
     def look(self) -> None:
-        """Ask for the next mode."""
-        if not self._controller.reason and self._controller.mode != Mode.POLICY:
-            self._controller.request(Mode.POLICY if self._controller.mode == Mode.STAND else Mode.STAND)
+        """Ask for the next mode, once."""
+        following = {Mode.DAMPING: Mode.STAND, Mode.STAND: Mode.POLICY}.get(self._mode)
+        if following and self._controller.mode == self._mode and not self._controller.request(following):
+            self._mode = following
 
 
 class Keyboard(Operator):
@@ -89,7 +92,8 @@ class Keyboard(Operator):
     def __enter__(self) -> "Keyboard":
         """Read single keys from now on."""
         if sys.stdin.isatty():
-            self._terminal = termios.tcgetattr(sys.stdin)
+            flags, *others = self._terminal = termios.tcgetattr(sys.stdin)
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, [flags & ~termios.IXON, *others])  # Ctrl-S stops no output
             tty.setcbreak(sys.stdin)
         return self
 
@@ -180,6 +184,7 @@ class Gamepad(Operator):
         self._sticks = np.zeros(3)
         try:
             self._file = os.open(device, os.O_RDONLY | os.O_NONBLOCK)
+            os.read(self._file, 512 * EVENT.size)  # how things are at first: no command
         except OSError as error:
             raise UserError(f"cannot open the gamepad '{device}': {error.strerror}") from None
 
@@ -196,11 +201,12 @@ class Gamepad(Operator):
             events = os.read(self._file, 64 * EVENT.size)
         if not events and "gone" not in self.note:
             self.ask(Mode.DAMPING)
+            self._sticks[:] = self._controller.velocity_command[:] = 0.0
             self.note = "the gamepad is gone"
         for _, value, kind, number in EVENT.iter_unpack(events):
             if kind == BUTTON and value and number in BUTTONS:
                 self.ask(BUTTONS[number])
-            elif kind == AXIS and number in AXES:
+            elif kind & ~NOT_NEW == AXIS and number in AXES:
                 self._sticks[AXES[number]] = -value / FULL
                 beyond = np.maximum(np.abs(self._sticks) - DEAD, 0.0) / (1.0 - DEAD)
                 self.move(beyond * np.where(self._sticks > 0.0, self._high, self._low))

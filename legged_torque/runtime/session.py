@@ -59,12 +59,12 @@ class Session:
             if self.log:
                 parts.callback(self.log.close)
             parts.callback(self._transport.close)
-            error: Exception | None = None
+            error: BaseException | None = None
             while time.monotonic() < end:
                 try:
+                    time.sleep(self.controller.period)
                     self.tick(self._clock(), missed=False)
-                except Exception as failure:  # the next message may arrive
+                except BaseException as failure:  # the next message may arrive, also after Ctrl-C
                     error = failure
-                time.sleep(self.controller.period)
             if error:
                 raise error

@@ -10,13 +10,14 @@ import mujoco
 import numpy as np
 
 from legged_torque.deploy.ground import place_ground
+from legged_torque.deploy.robot import joints_and_motors
 from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import hang_up, loading, set_joints
+from legged_torque.utils.mjcf import hang_up, loading, set_joints, torque_per_control, torque_range
 
-WATCHDOG = 0.02  # seconds without a command after which the drives damp by themselves
+WATCHDOG = 0.016  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
 STEP = 1e-3  # longest of the physics, at which the drives close their loops [s]
 FOLDED = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}  # angles of a robot that lies on its belly [rad]
@@ -64,7 +65,7 @@ class SimRobot:
 
         Its motors are ideal unless their settings are given; gains of a drive come with commands, which arrive
         ``latency`` [s] late. If it ``hangs``, it is held by its trunk and touches nothing. A UserError if the file is
-        unreadable, or the robot has other joints than hips, thighs and calves.
+        unreadable or lacks a motor, or the robot has other joints than hips, thighs and calves, or a network of motors.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -75,12 +76,10 @@ class SimRobot:
             spec.option.timestep = 1.0 / (rate * self._steps)
             self.model = spec.compile()
         self.data, self.joint_order = mujoco.MjData(self.model), joint_order
-        joints = [self.model.joint(name) for name in joint_order]
-        self._qpos = np.array([joint.qposadr[0] for joint in joints])
-        self._dofs = np.array([joint.dofadr[0] for joint in joints])
-        owners = self.model.actuator_trnid[:, 0].tolist()
-        self._motors = np.array([owners.index(joint.id) for joint in joints])
-        self.limits = self.model.actuator_ctrlrange[self._motors].T.copy()
+        joints, self._motors = joints_and_motors(self.model, joint_order)
+        self._qpos, self._dofs = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
+        self._torque_per_control = np.array([torque_per_control(self.model, motor) for motor in self._motors])
+        self.limits = np.array([torque_range(self.model, motor) for motor in self._motors]).T
         self._drives = MotorTwin(self._description(motors))
         set_joints(self.model, motors.of_joints(joint_order) if motors else {})
         if hangs:
@@ -127,7 +126,7 @@ class SimRobot:
             pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]
             asked = (command or damping).torques(pos, vel)
             self._applied = np.where(is_dead, 0.0, self._drives.apply(asked, pos, vel))
-            self.data.ctrl[self._motors] = self._applied
+            self.data.ctrl[self._motors] = self._applied / self._torque_per_control
             mujoco.mj_step(self.model, self.data)
         self.watchdog_ticks += had_command and self.is_damping
 
@@ -140,6 +139,8 @@ class SimRobot:
         described = {"joint_order": names, "timing": timing, "torque_limits": limits, "nominal_pose": zeros}
         links = motors.describe().items() if motors else ()
         own = {name: link for name, link in links if link.get("model") != "drive"}
+        if any(link.get("model") == "network" for link in own.values()):
+            raise UserError("a network of motors needs a robot's gains; those of a simulated robot come with commands")
         return {**described, "gains": gains, "motors": own}
 
     def says(self) -> tuple[RobotState | None, bool]:

@@ -288,6 +288,13 @@ def add_command_arg(parser: Parser, kind: str = "fixed", default: str = "drawn a
     parser.add_argument("--command", type=float, nargs=3, metavar=("X", "Y", "YAW"), help=hint)
 
 
+def video_file(name: str) -> Path:
+    """Return the file of a video, as argparse's type of an option; a UserError if its name ends otherwise."""
+    if not name.lower().endswith((".mp4", ".gif")):
+        raise UserError(f"a video is an mp4 or a gif, by the end of its name, not '{name}'")
+    return Path(name)
+
+
 def check_output(file: Path) -> None:
     """Raise a UserError if a file cannot be written later; nothing is created or changed yet."""
     with write_errors(file):

@@ -13,9 +13,11 @@ from support.exports import change
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
+from legged_torque.deploy.export import write_description
 from legged_torque.deploy.policy import Policy
 from legged_torque.envs import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils import devices
 
 GROUND = dataclasses.asdict(Layout.of(LeggedRobotCfg.terrain()))
 ENDLESS = {"control_frequency": 1e-6, "physics_frequency": 100.0, "decimation": 10**8, "refresh_torques": True}
@@ -35,6 +37,16 @@ def test_damaged_descriptions(exported, description, tmp_path, path, value, mess
     change(path, value)(damaged)
     (folder / "policy.yaml").write_text(yaml.safe_dump(damaged, sort_keys=False))
     assert message in error_of(Policy, folder)
+
+
+def test_notes_of_strangers(exported, description, tmp_path, monkeypatch):
+    """Names in what publish.py notes do not change a terminal."""
+    folder, changed = shutil.copytree(exported, tmp_path / "copy"), copy.deepcopy(description)
+    changed["episode"]["ends_on_contact_of"] = ["\x1b[31m"]
+    write_description(folder, changed)
+    monkeypatch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
+    status, output, _ = run_here("publish.py", str(folder), root=tmp_path)
+    assert status == 0 and "note: no geom's name contains \\x1b[31m" in output
 
 
 def test_one_file_is_enough(exported, description, tmp_path):

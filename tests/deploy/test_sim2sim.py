@@ -207,6 +207,7 @@ def test_script(exported, tmp_path, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     for words, message in {
+        "--video=walk.webm": "a video is an mp4 or a gif, by the end of its name, not 'walk.webm'",
         "--push_probability=0.1": "--push_probability needs --push_velocity",
         "--push_velocity=1 --push_probability=2": "--push_probability must be from 0 to 1",
         "--viewer": "MuJoCo's window needs a screen; --video works without one",

@@ -2,18 +2,20 @@
 
 import json
 import re
+import runpy
 
 import numpy as np
 import pytest
+import yaml
 from support.one_leg import NUMBERS, POSE, TILT, TRUTH, noisy, record, sweep, write_log
-from support.scripts import run_here
+from support.scripts import ROOT, run_here
 from support.settings import error_of
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.identification import fit
 from legged_torque.identification.recording import Recording
-from legged_torque.identification.worlds import FIELDS, HangingRobots
+from legged_torque.identification.worlds import FIELDS, PARAMETERS, HangingRobots
 from legged_torque.runtime.sim_robot import SimRobot
 from legged_torque.utils.options import Options
 
@@ -68,6 +70,13 @@ def test_settings(found):
     assert (cfg.motors.delay.unit, cfg.motors.delay.range) == ("milliseconds", [5, 5])
     assert cfg.domain_rand.keep_fixed == ["dof_armature", "dof_damping", "dof_frictionloss"]
     assert cfg.domain_rand.joint_offset["add"][1] == pytest.approx(0.055, rel=0.05)
+
+
+def test_a_delay_below_zero():
+    """It is written as none, which ``--motors`` takes."""
+    script = runpy.run_path(str(ROOT / "scripts" / "identify.py"))
+    text = script["settings_text"](list(POSE), dict(zip(PARAMETERS, -np.ones((5, 3)), strict=True)), 0.005, FIELDS)
+    assert yaml.safe_load(text)["motors"]["delay"] == {"unit": "milliseconds", "range": [0, 0]}
 
 
 def problem_of(leg, recording):

@@ -52,8 +52,11 @@ def test_delay_that_varies(tmp_path):
     assert "--latency gives one time" in error_of(simulated_latency, cfg, str(tmp_path / "own.yaml"), None)
 
 
-def test_other_robot():
-    """Joints that the robot does not have."""
+def test_other_robot(tmp_path):
+    """Joints that the robot does not have, and links that the task does not have, also for simulated robots."""
     cfg = task_registry.get_cfgs("go2_torque")[0]
+    (tmp_path / "own.yaml").write_text("motors: {chain: [delay, idael]}")
+    assert simulated_latency(cfg, str(tmp_path / "own.yaml"), None) == 0.0
+    assert "unknown motors.chain 'idael'; did you mean 'ideal'?" in error_of(cfg.motors.describe)
     cfg.motors.joints.armature = {"knee": 0.1, "joint": 0.1}
     assert "unknown joint" in error_of(load_asset, cfg)

@@ -16,6 +16,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of
+from legged_torque.runtime.chirp import Chirp
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
@@ -55,16 +56,17 @@ def test_drives_get_their_gains_by_commands():
     assert np.array_equal(*at)
 
 
-def test_a_log_is_closed_whatever_fails(policy, tmp_path):
-    """A transport that can no longer send does not cost the log its end."""
-    world = World(policy)
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_the_end_comes_whatever_fails(policy, tmp_path, error):
+    """A transport that can no longer send, or Ctrl-C, ends neither the farewell nor the log before its time."""
+    world, failing = World(policy), iter([error])
     log = Log(tmp_path / "log.mcap", world.controller)
     session = Simulated(world.controller, InProcess(world.robot), log)
     session.tick(0.0, missed=False)
-    session._transport.send = lambda command: (_ for _ in ()).throw(OSError("the interface is down"))
-    with pytest.raises(OSError, match="is down"):
+    session._transport.send = lambda command: [(_ for _ in ()).throw(each) for each in failing]
+    with pytest.raises(error):
         session.close()
-    assert len(list(RecordedLog(tmp_path / "log.mcap").ticks())) == 1
+    assert len(list(RecordedLog(tmp_path / "log.mcap").ticks())) > 2
 
 
 def random_state(rng, joints=12):
@@ -96,7 +98,7 @@ def test_drives_do_what_the_policy_wants(make_task, tmp_path, stiffness, damping
 
 
 def test_torques_stay_within_limits_and_change_slowly():
-    """Whatever is asked for; within both, nothing changes."""
+    """Whatever is asked for; within both, nothing changes. Near a limit, they stay so until the next state."""
     rng = np.random.default_rng(0)
     limits = np.array([[-20.0] * 12, [30.0] * 12])
     joints = Joints([f"joint {i}" for i in range(12)], limits, 100 * limits, limits[1])
@@ -112,6 +114,10 @@ def test_torques_stay_within_limits_and_change_slowly():
             asked = command.torques(*at)
             is_allowed = (np.abs(asked - before) < 4.0) & (asked > limits[0]) & (asked < limits[1])
             np.testing.assert_allclose(result[is_allowed], asked[is_allowed], rtol=1e-9)
+            is_near = (result < 0.91 * limits[0]) | (result > 0.91 * limits[1])
+            later = random_state(rng)
+            later = limited(command, state, before, 4.0, joints).torques(later.joint_positions, later.joint_velocities)
+            np.testing.assert_array_equal(later[is_near], result[is_near])
 
 
 def test_tilt():
@@ -141,17 +147,19 @@ def test_from_lying_to_walking_and_back(policy):
 
 
 def test_the_wrong_robot(policy):
-    """Joints that one of both does not know, an export without ranges, and rates that do not fit are refused."""
+    """Joints that one does not know, exports without ranges or speeds, and rates that do not fit are refused."""
     order = policy.joint_order
     for wrong in (order[:-1], [*order, "tail"], ["FR_hp_joint", *order[1:]]):
         with pytest.raises(UserError, match="joint"):
             Controller(policy, wrong, RATE)
     with pytest.raises(UserError, match="multiple of the policy's 50 Hz"):
         Controller(policy, order, 490.0)
-    had = policy.description["joints"][order[3]].pop("range")
-    with pytest.raises(UserError, match="export the policy anew"):
-        Controller(policy, order, RATE)
-    policy.description["joints"][order[3]]["range"] = had
+    for lacking in ("range", "max_velocity"):
+        had = policy.description["joints"][order[3]].pop(lacking)
+        for wrong in (policy, Chirp(policy, RATE, 10.0)):
+            with pytest.raises(UserError, match="export the policy anew"):
+                Controller(wrong, order, RATE)
+        policy.description["joints"][order[3]][lacking] = had
     policy.supplied = ["felt"]
     with pytest.raises(UserError, match="observes felt"):
         Controller(policy, order, RATE)
@@ -182,6 +190,7 @@ FAULTS = {
     "late": lambda world: setattr(world.robot.faults, "delay", 0.1),
     "damaged": lambda world: setattr(world.robot.faults, "damaged", 1.0),
     "not finite": lambda world: setattr(world.robot.faults, "not_finite", True),
+    "no orientation": lambda world: world.robot.data.qpos.__setitem__(slice(3, 7), 0.0),
     "hot": lambda world: world.robot.faults.hot.append("RR_calf_joint"),
     "error flag": lambda world: world.robot.faults.error.append("FL_hip_joint"),
     "tilted": turned,

@@ -1,6 +1,8 @@
 """A policy on a simulated Go2 in another process, over DDS, and the scripts of both sides."""
 
+import contextlib
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -19,6 +21,7 @@ from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import RecordedLog
+from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
 
 RATE, DOMAIN, OTHER = 500.0, 200 + os.getpid() % 16, 216 + os.getpid() % 16
@@ -103,6 +106,34 @@ def test_over_the_wire_as_in_process(exported, tmp_path):
     assert place[2] > 0.2 and excess < 1e-3 and not watchdog
 
 
+def test_ctrl_c_in_the_farewell(exported, tmp_path, monkeypatch):
+    """It does not cut that short."""
+    close = Session.close
+    monkeypatch.setattr(Session, "close", lambda self: (signal.raise_signal(signal.SIGINT), close(self)))
+    assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[::2] == (0, "")
+
+
+def test_a_terminal_that_waits(exported, tmp_path):
+    """A robot whose view cannot be written, as after Ctrl-S, is still stopped in time, and its log is whole."""
+    (end, full), log = os.pipe(), tmp_path / "log.mcap"
+    os.set_blocking(full, False)
+    with contextlib.suppress(BlockingIOError):
+        while os.write(full, bytes(4096)):
+            pass
+    os.set_blocking(full, True)
+    words = [str(exported), "--interface=sim", "--walk", "--seconds=1", f"--log={log}"]
+    with subprocess.Popen([sys.executable, str(ROOT / "scripts" / "deploy.py"), *words], stdout=full) as process:
+        os.close(full)
+        until, last = time.monotonic() + 60.0, b""
+        while not (last.endswith(b"MCAP0\r\n") and len(last) > 1000) and time.monotonic() < until:
+            time.sleep(0.1)
+            last = log.read_bytes() if log.exists() else b""
+        with open(end, "rb") as output:
+            output.read()
+    assert time.monotonic() < until and process.returncode == 0
+    assert [rest["mode"] for *_, rest in RecordedLog(log).ticks()][-1] == "damping"
+
+
 WITHOUT_TORCH = """
 import runpy, sys
 for name in ("torch", "warp", "rsl_rl", "mujoco_warp", "tensordict"):
@@ -144,10 +175,14 @@ def test_scripts(make_task, exported, tmp_path):
         ("deploy.py", ["--interface=sim", "--gamepad=js7"], "cannot open the gamepad 'js7'"),
         ("deploy.py", ["--interface=sdk", "--power=11"], "--power must be from 1 to 10"),
         ("deploy.py", ["--interface=sim", "--power=2"], "--power is for --interface sdk"),
+        ("deploy.py", ["--interface=sim", "--domain=0"], "--domain is of DDS"),
+        ("deploy.py", ["--interface=sim", "--chirp", "--command", "0", "0", "0"], "--command is for policies"),
         ("sim_robot.py", ["--motors=rael"], "did you mean 'real'?"),
         ("sim_robot.py", ["--fault=lots=1"], "unknown fault 'lots'; did you mean 'lost'?"),
         ("sim_robot.py", ["--fault=dead=FR_hip"], "did you mean 'FR_hip_joint'?"),
         ("sim_robot.py", ["--fault=lost=many"], "takes a number, not 'many'"),
+        ("sim_robot.py", ["--fault=lost=2"], "--fault lost must be from 0 to 1, not 2"),
+        ("sim_robot.py", ["--fault=delay=nan"], "--fault delay must be finite"),
     ):
         given = [str(exported)] if script == "deploy.py" else []
         assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)

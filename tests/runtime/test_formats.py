@@ -57,6 +57,18 @@ def test_deploy_yaml(make_task, tmp_path, limits):
         np.testing.assert_allclose(told, np.array([position, kp, kd])[:, order], rtol=1e-5, atol=1e-5)
 
 
+def test_an_earlier_policy(make_task, tmp_path):
+    """It is replaced in all formats, also in those that are not asked for any more; files of others stay."""
+    for add in (write_deploy_yaml, write_leapp, None):
+        export(make_task, "go2_position", tmp_path, add)
+    assert {path.name for path in (tmp_path / "out").rglob("*.*")} == {"policy.onnx", "policy.pt", "policy.yaml"}
+    assert not [*(tmp_path / "out").glob("*/*")]
+    (tmp_path / "out" / "policy.yaml").unlink()
+    (tmp_path / "out" / "params" / "deploy.yaml").touch()
+    export(make_task, "go2_position", tmp_path, None)
+    assert (tmp_path / "out" / "params" / "deploy.yaml").exists()
+
+
 @pytest.mark.parametrize("name", ["go2_position", "go2_torque", "a1_multihead"])
 def test_leapp(make_task, tmp_path, name):
     """NVIDIA's reader makes the same targets, torques and gains, from step to step, and knows what they are."""

@@ -100,12 +100,19 @@ def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path, keeps_tim
 
 
 def test_mistakes(policy, recorded, tmp_path, monkeypatch):
-    """A file that exists, one that is no log, and missing packages: one line each."""
+    """A file that exists, one that is no log or damaged, and missing packages: one line each."""
     controller = Controller(policy, policy.joint_order, RATE)
     assert "exists" in error_of(Log, recorded[0] / "log.mcap", controller)
     (tmp_path / "no.mcap").write_bytes(b"something else")
     assert "no log" in error_of(RecordedLog, tmp_path / "no.mcap")
     assert "cannot read" in error_of(RecordedLog, Path("nowhere.mcap"))
+    content = bytearray((recorded[0] / "log.mcap").read_bytes())
+    content[len(content) // 2] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(content)
+    assert "damaged.mcap' is no log" in error_of(list, RecordedLog(tmp_path / "damaged.mcap").ticks())
+    controller.period = 0.0
+    Log(tmp_path / "still.mcap", controller).close()
+    assert "its period is 0 s" in error_of(RecordedLog, tmp_path / "still.mcap")
     monkeypatch.delitem(sys.modules, "legged_torque.runtime.log")
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     assert "legged_torque[robot]" in error_of(__import__, "legged_torque.runtime.log")

@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import select
 import socket
 import struct
 import time
@@ -108,14 +109,16 @@ def test_gamepad(robot, tmp_path):
     """Events as the kernel tells them: sticks with a dead zone, buttons; a device that is gone damps."""
     file = tmp_path / "js0"
     os.mkfifo(file)
-    with operator.Gamepad(robot.controller, str(file)) as gamepad, file.open("wb", 0) as device:
+    device = file.open("r+b", 0)
+    device.write(struct.pack("<IhBB", 1, 30000, 0x82, 1))  # how things were at first
+    with operator.Gamepad(robot.controller, str(file)) as gamepad:
         for events, expected in (
             ([], (Mode.DAMPING, STILL)),
-            ([(1, 0x81, 0), (30000, 0x82, 1)], (Mode.DAMPING, STILL)),  # how things were at first
+            ([(1, 0x81, 0)], (Mode.DAMPING, STILL)),
             ([(-32767, 2, 1), (3000, 2, 0), (18022, 2, 3), (1, 2, 2), (1, 1, 0)], (Mode.STAND, [1.0, 0.0, -0.5])),
-            ([(0, 2, 1), (0, 2, 3), (0, 1, 0), (1, 1, 2)], (Mode.POLICY, STILL)),
+            ([(0, 0x82, 1), (0, 2, 3), (0, 1, 0), (1, 1, 2)], (Mode.POLICY, STILL)),  # the first after events were lost
             ([(1, 1, 1), (0, 1, 1)], (Mode.DAMPING, STILL)),
-            ([(1, 1, 0)], (Mode.STAND, STILL)),
+            ([(1, 1, 0), (-32767, 2, 1)], (Mode.STAND, [1.0, 0.0, 0.0])),
         ):
             device.write(b"".join(struct.pack("<IhBB", 1234, *event) for event in events))
             gamepad.look()
@@ -123,7 +126,19 @@ def test_gamepad(robot, tmp_path):
         device.close()
         gamepad.look()
         gamepad.look()
-        assert does(robot)[0] == Mode.DAMPING and gamepad.note == "the gamepad is gone"
+        assert does(robot) == (Mode.DAMPING, STILL) and gamepad.note == "the gamepad is gone"
+
+
+@pytest.mark.parametrize("reached", [Mode.STAND, Mode.POLICY])
+def test_unattended(robot, reached):
+    """A robot that another operator has damped stays so."""
+    unattended = operator.Unattended(robot.controller)
+    while does(robot)[0] != reached:
+        unattended.look()
+    robot.controller.request(Mode.DAMPING)
+    for _ in range(2):
+        unattended.look()
+        assert does(robot)[0] == Mode.DAMPING
 
 
 def test_keys(robot, monkeypatch):
@@ -132,6 +147,10 @@ def test_keys(robot, monkeypatch):
     with open(slave) as terminal:
         monkeypatch.setattr("sys.stdin", terminal)
         with operator.Keyboard(robot.controller) as keyboard:
+            os.set_blocking(slave, False)
+            os.write(master, b"\x13?")  # Ctrl-S, which would hold up all that is written
+            assert select.select([slave], [], [], 10.0)[0] and os.write(slave, b"x") == 1
+            keyboard.look()
             for keys, *expected in (
                 (b"p\x1b[A\x1b[A,", Mode.DAMPING, [0.2, 0.1, 0.0]),
                 (b"s.\x1b[B\x1b[D", Mode.STAND, [0.1, 0.0, 0.1]),
