@@ -35,8 +35,9 @@ def parse_args() -> argparse.Namespace:
     hint = "network interface of a Unitree Go2, lo for sim_robot.py, sim for a simulated robot in this process, "
     hint += "or sdk for an A1 or Go1 through unitree_legged_sdk"
     parser.add_argument("--interface", required=True, help=hint)
-    parser.add_argument("--domain", type=int, help="of DDS; Unitree's robots: 0; default: 0")
-    hint = "commands per second; default: the largest multiple of the policy's rate up to 500"
+    parser.add_argument("--domain", type=int, help="of DDS alone; default: 0, Unitree's")
+    hint = "commands per second; default: the largest multiple of the policy's rate up to 500; "
+    hint += "sim_robot.py damps below 63"
     parser.add_argument("--rate", type=float, help=hint)
     cli.add_command_arg(parser, "first", "stand still")
     hint = "obey JSON datagrams on a port of this machine, or of one of its addresses; docs/howto/run_on_robot.md"

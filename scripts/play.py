@@ -94,7 +94,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--terrain", nargs="+", metavar="KIND", default=[], help=hint)
     hint = "difficulties of rough ground, 0 to 1: a row of tiles of each; default: those of the training"
     parser.add_argument("--level", nargs="+", type=float, default=[], help=hint)
-    parser.add_argument("--video", type=cli.video_file, help="mp4 to write; default: in the run's folder")
+    parser.add_argument("--video", type=cli.video_file, help="mp4 or gif to write; default: in the run's folder")
     parser.add_argument("--no_video", action="store_true", help="print metrics alone")
     parser.add_argument("--grid", type=int, help="number of robots in the video: 1, 4, 9, 16 or 25; default: 1")
     hint = """none: roll out, print metrics, save a video; web: a page to watch and steer the robots; native: MuJoCo's

@@ -44,7 +44,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--level", nargs="+", type=float, default=(), help=hint)
     hint = "with height fields: corrected to those of training, or MuJoCo's own; default: %(default)s"
     parser.add_argument("--contacts", choices=("training", "mujoco"), default="training", help=hint)
-    parser.add_argument("--video", type=cli.video_file, help="mp4 of the first robot")
+    parser.add_argument("--video", type=cli.video_file, help="mp4 or gif of the first robot")
     parser.add_argument("--viewer", action="store_true", help="show it in real time in MuJoCo's window")
     parser.add_argument("--json", type=Path, help="JSON file of arguments and metrics to write")
     cli.add_options(parser, "motors", "task_file", "log_root")

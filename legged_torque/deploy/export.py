@@ -85,7 +85,7 @@ def export_policy(
     Args:
         task: The task, with settings of :func:`nominal_cfg` and the counters of the checkpoint. Its state is changed.
         model: The policy's network. It reads the observation group "policy", then any groups of single terms.
-        folder: Where to write; files of an earlier export there are replaced, ``policy.yaml`` last.
+        folder: Where to write; files of an earlier export there are replaced or removed, ``policy.yaml`` last.
         name: Name of the task.
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
         add: Adds files of another format to an export, for its folder and network.
@@ -109,7 +109,8 @@ def export_policy(
         write_description(part, description)
         if add:
             add(part, model.as_onnx(verbose=False).cpu().eval())
-        others = (*folder.glob("leapp/*.*"), folder / "params/deploy.yaml", folder / "exported/policy.onnx")
+        unitree = [folder / "params/deploy.yaml", folder / "exported/policy.onnx"]
+        others = (*folder.glob("leapp/*.*"), *(unitree if unitree[0].is_file() else ()))
         for file in others if (folder / DESCRIPTION_FILE).is_file() else ():  # an earlier policy in other formats
             file.unlink(missing_ok=True)
         for file in sorted(part.rglob("*.*"), key=lambda file: file.name == DESCRIPTION_FILE):

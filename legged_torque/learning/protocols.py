@@ -48,11 +48,12 @@ class Stateful(Protocol):
 class Learner(Stateful, Protocol):
     """A reinforcement learning algorithm, built by ``construct_algorithm(obs, env, cfg, device)`` as in rsl_rl.
 
-    Tensors of its :meth:`state_dict` have memory of their own. Some methods are optional. ``allocate()`` takes what
-    memory training needs, before the run's folder is made. ``set_progress(iteration, num_iterations)`` is called before
-    each update. ``broadcast_parameters()`` gives all processes the parameters of the first one; a learner without it
-    trains in one process only. ``world_state_dict()`` and ``load_world_state_dict(state)`` are for what belongs to the
-    worlds, such as a replay: only the newest checkpoint keeps it. ``close()`` is called when training is over.
+    Tensors of its :meth:`state_dict` have memory of their own. Some methods are optional. ``allocate()`` takes or
+    refuses what only training needs, before the run's folder is made. ``set_progress(iteration, num_iterations)`` is
+    called before each update. ``broadcast_parameters()`` gives all processes the parameters of the first one; a learner
+    without it trains in one process only. ``world_state_dict()`` and ``load_world_state_dict(state)`` are for what
+    belongs to the worlds, such as a replay: only the newest checkpoint keeps it. ``close()`` is called when training is
+    over.
 
     Attributes:
         capturable: Whether :meth:`act` and :meth:`observe` may be captured in a CUDA graph: fixed shapes and addresses,

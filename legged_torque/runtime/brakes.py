@@ -7,7 +7,6 @@ import numpy as np
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 
 LARGEST_ASKED = 10.0  # times its limit: a torque beyond this is a mistake, not a wish
-NEAR_LIMIT = 0.9  # share of its limit from which on a torque is held until the next state
 MAX_LENGTH_ERROR = 0.1  # of a quaternion; 0 is what an IMU says that has not started
 
 
@@ -84,14 +83,12 @@ def limited(
 ) -> MotorCommand:
     """Return a command whose torques in a state are within the limits, and near those before. Shape: (joints,) [N m].
 
-    The feed-forward torque takes the difference, so that gains stay those of the policy. Near a limit it is all: with
-    gains, drives would leave the limits as joints move on.
+    The feed-forward torque takes the difference, so that gains stay those of the policy: should no command follow,
+    torques fall as the joints move.
     """
-    asked, (low, high) = command.torques(state.joint_positions, state.joint_velocities), joints.torque_limits
-    allowed = np.clip(np.clip(asked, low, high), before - largest_change, before + largest_change)
-    is_near = (allowed < NEAR_LIMIT * low) | (allowed > NEAR_LIMIT * high)
-    kp, kd = (np.where(is_near, 0.0, gain) for gain in (command.kp, command.kd))
-    return MotorCommand(np.where(is_near, allowed, command.tau + allowed - asked), command.q, command.dq, kp, kd)
+    asked = command.torques(state.joint_positions, state.joint_velocities)
+    allowed = np.clip(np.clip(asked, *joints.torque_limits), before - largest_change, before + largest_change)
+    return MotorCommand(command.tau + allowed - asked, command.q, command.dq, command.kp, command.kd)
 
 
 def mistake(command: MotorCommand, state: RobotState, joints: Joints) -> str:

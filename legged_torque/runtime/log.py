@@ -31,7 +31,7 @@ _CHUNK = 2**16  # bytes that are written at a time
 
 
 class Log:
-    """Writes what a controller does: the control loop only keeps ticks by :meth:`add`, any other thread writes them.
+    """Writes what a controller does: the control loop only keeps ticks by :meth:`add`; another thread writes them.
 
     A log that was not closed can be read too, but for its last 64 KB. A disk that is full does not stop the robot.
 
@@ -120,7 +120,7 @@ class RecordedLog:
         except OSError as error:
             raise UserError(f"cannot read '{file}': {error.strerror}") from None
         except (StopIteration, KeyError, ValueError) as error:
-            raise UserError(f"'{file}' is no log of deploy.py: {error or 'it does not say whose'}") from None
+            raise UserError(f"'{file}' is no log of deploy.py: {str(error) or 'it does not say whose'}") from None
 
     def ticks(self) -> Iterator[tuple[float, RobotState | None, MotorCommand, dict[str, Any]]]:
         """Yield time [s], state, command and the rest of each tick."""

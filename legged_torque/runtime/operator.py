@@ -26,7 +26,7 @@ NUMBERS = ("forward", "sideways", "turn")  # of a datagram: v_x, v_y [m/s] and y
 LONGEST, AT_ONCE = 256, 100  # bytes of a datagram, and datagrams of a look
 SILENCE = 1.0  # seconds without datagrams after which the command is 0
 EVENT = struct.Struct("<IhBB")  # of a gamepad: time [ms], value, kind, number of the button or axis
-BUTTON, AXIS, NOT_NEW = 1, 2, 0x80  # kinds, and a bit of what is told at first, and again after events were lost
+BUTTON, AXIS, NOT_NEW = 1, 2, 0x80  # kinds, and the bit of states told at first, and again after lost events
 BUTTONS = {0: Mode.STAND, 1: Mode.DAMPING, 2: Mode.POLICY}
 AXES = {1: 0, 0: 1, 3: 2}  # index in the command by number; values are negative forwards and to the left
 DEAD, FULL = 0.1, 32767  # an axis' zone around its middle, as a share; its largest value
@@ -73,14 +73,16 @@ class Operator(contextlib.AbstractContextManager["Operator"]):
 
 
 class Unattended(Operator):
-    """Has a simulated robot stand up and walk, until a fault or another operator ends that."""
+    """Has a simulated robot stand up and walk, once: a fault or another operator ends that."""
 
     _mode = Mode.DAMPING  # the last one that was reached
 
     def look(self) -> None:
-        """Ask for the next mode, once."""
+        """Ask for the next mode, until one is not as it was left."""
         following = {Mode.DAMPING: Mode.STAND, Mode.STAND: Mode.POLICY}.get(self._mode)
-        if following and self._controller.mode == self._mode and not self._controller.request(following):
+        if following and self._controller.mode != self._mode:
+            self._mode = Mode.PASSIVE  # after which nothing follows
+        elif following and not self._controller.request(following):
             self._mode = following
 
 

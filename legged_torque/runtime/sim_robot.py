@@ -17,7 +17,7 @@ from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import hang_up, loading, set_joints, torque_per_control, torque_range
 
-WATCHDOG = 0.016  # seconds without a command after which the drives damp by themselves
+WATCHDOG = 0.015  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
 STEP = 1e-3  # longest of the physics, at which the drives close their loops [s]
 FOLDED = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}  # angles of a robot that lies on its belly [rad]
@@ -65,7 +65,7 @@ class SimRobot:
 
         Its motors are ideal unless their settings are given; gains of a drive come with commands, which arrive
         ``latency`` [s] late. If it ``hangs``, it is held by its trunk and touches nothing. A UserError if the file is
-        unreadable or lacks a motor, or the robot has other joints than hips, thighs and calves, or a network of motors.
+        unreadable or lacks a motor, a joint is no hip, thigh or calf, or a motor is a network.
         """
         if unknown := [name for name in joint_order if not any(part in name for part in FOLDED)]:
             raise UserError(f"a simulated robot has {', '.join(FOLDED)} joints, as A1 and Go2, and no '{unknown[0]}'")
@@ -140,7 +140,7 @@ class SimRobot:
         links = motors.describe().items() if motors else ()
         own = {name: link for name, link in links if link.get("model") != "drive"}
         if any(link.get("model") == "network" for link in own.values()):
-            raise UserError("a network of motors needs a robot's gains; those of a simulated robot come with commands")
+            raise UserError("a motor network needs fixed gains; those of a simulated robot come with commands")
         return {**described, "gains": gains, "motors": own}
 
     def says(self) -> tuple[RobotState | None, bool]:

@@ -32,7 +32,7 @@ class View:
     def __init__(self, session: Session, loop: RealTimeLoop, operators: Sequence[Operator]) -> None:
         """Take what is shown."""
         self._session, self._loop, self._operators = session, loop, operators
-        console = Console(emoji=False)  # whose table takes 12 ms to load, in which no tick is made
+        console = Console(emoji=False)  # loading emoji takes 12 ms without a tick
         self.live = Live(console=console, auto_refresh=False) if is_terminal(sys.stdout) else contextlib.nullcontext()
         self._due, self._counted, self._rates = 0.0, np.array([time.monotonic(), 0, 0]), np.zeros(2)
 

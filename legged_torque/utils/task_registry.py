@@ -229,18 +229,22 @@ class TaskRegistry:
         """Create the task of a run, and a runner that holds the policy of its checkpoint and keeps nothing.
 
         ``env_cfg`` are settings of the task in place of the run's; its critic may see other things, as it is not
-        loaded. A UserError if the checkpoint cannot be read or is of another kind of policy, or if the policy sees
-        random parameters, which it knows as shares of their ranges, with other ranges.
+        loaded. A UserError if the checkpoint cannot be read or is of another kind of policy, or see
+        :meth:`check_ranges`.
         """
-        if "critic" in run.train_cfg.obs_groups.actor:
-            trained = self.get_cfgs(run.task, Options(device="cpu"), run.config)[0].random_parameters()
-            for name, value in (env_cfg or run.env_cfg).random_parameters().items():
-                if value != trained[name]:
-                    raise UserError(f"the policy sees domain_rand.{name} as shares of {trained[name]}, not of {value}")
+        self.check_ranges(run, env_cfg or run.env_cfg)
         env, _ = self.make_env(run.task, options, env_cfg or run.env_cfg)
         runner, _ = self.make_alg_runner(env, run.task, train_cfg=run.train_cfg, log_root=None)
         runner.load(str(run.checkpoint), {"actor": True, "iteration": True})
         return env, runner
+
+    def check_ranges(self, run: LoadedRun, env_cfg: Any) -> None:
+        """Raise a UserError if a run's policy sees random parameters, as shares of their ranges, in other ranges."""
+        if "critic" in run.train_cfg.obs_groups.actor:
+            trained = self.get_cfgs(run.task, Options(device="cpu"), run.config)[0].random_parameters()
+            for name, value in env_cfg.random_parameters().items():
+                if value != (known := trained.get(name)):
+                    raise UserError(f"the policy sees domain_rand.{name} as shares of {known}, not of {value}")
 
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
         """Return class and settings of a task; an unknown name is a UserError."""

@@ -84,6 +84,7 @@ class Session:
         sleep: Callable[[float], None] = time.sleep,  # [s]
     ) -> None:
         """Build the task and load the checkpoint; a UserError if that cannot be loaded."""
+        task_registry.check_ranges(run, run.env_cfg)
         self._make_task = functools.partial(watched(task_class), device=device)
         self._run, self._clock, self._sleep = run, clock, sleep
         self._stop, self._next_scan, self._tried = threading.Event(), -math.inf, -1

@@ -36,7 +36,7 @@ Step = Sequence[np.ndarray]
 
 
 class VideoRecorder:
-    """Collects the motion of robots and draws it as an mp4 in real time.
+    """Collects the motion of robots and draws it as a video in real time.
 
     A green arrow is the commanded velocity, a blue one the actual velocity; numbers show both. Several robots are the
     tiles of a grid, row by row.

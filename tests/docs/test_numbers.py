@@ -1,7 +1,6 @@
 """The tables of the documents, recomputed from the raw data beside them."""
 
 import json
-import math
 import re
 from itertools import product
 
@@ -273,7 +272,7 @@ def test_students():
     assert len(lost) == 3 and f"track {lost.min():.1f} to {lost.max():.1f}% less" in text
     assert "{:.1f}, {:.1f} and {:.1f}% fewer cross".format(*fewer.max(axis=1)) in text
     later = [less(numbers, "student, 120 million", trained).to_numpy().max() for numbers in (tracked, crossed)]
-    assert "tracks at most {:.1f}% less, and {:.1f}% fewer cross".format(*later) in text
+    assert "tracks at most {:.1f}% less, and at most {:.1f}% fewer cross".format(*later) in text
     stones = less(tracked, "student", ["stepping_stones"]).to_numpy()
     assert f"students track {stones.min():.0f} to {stones.max():.0f}% less" in text
 
@@ -366,10 +365,10 @@ def test_faults():
     for faults, *times in rows:
         of = longest.loc[(slice(None), faults.split(", ")), "max"].groupby("policy_hz").max()
         assert [f"{of[rate]:.0f}" for rate in (50, 200)] == times
-    most = data[~data["fault"].str.startswith("joint")].groupby("policy_hz")["excess"].max()
-    assert f"up to {most[200]:.0f} N m beyond limits at 200 Hz" in text_of(page, "## Brakes") and most[50] < 1e-3
-    late = data[data["fault"] == "late ticks"]["ms"].sort_values()
-    assert f"all but one ended within {math.ceil(late.iloc[-2])} ms" in text_of(page, "## Brakes")
+    text = text_of(page, "## Brakes").replace("\n", " ")
+    beyond = set(data[data["excess"] > 0.0]["fault"])
+    assert beyond == {"joint too fast", "joint beyond its range"} and "only while a joint was set to another" in text
+    assert f"once after {data['ms'].max():.1f} ms" in text and (data["ms"] > 20.0).sum() == 1
 
 
 def test_kernels_of_an_update():

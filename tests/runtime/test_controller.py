@@ -98,7 +98,7 @@ def test_drives_do_what_the_policy_wants(make_task, tmp_path, stiffness, damping
 
 
 def test_torques_stay_within_limits_and_change_slowly():
-    """Whatever is asked for; within both, nothing changes. Near a limit, they stay so until the next state."""
+    """Whatever is asked for; within both, nothing changes."""
     rng = np.random.default_rng(0)
     limits = np.array([[-20.0] * 12, [30.0] * 12])
     joints = Joints([f"joint {i}" for i in range(12)], limits, 100 * limits, limits[1])
@@ -114,10 +114,6 @@ def test_torques_stay_within_limits_and_change_slowly():
             asked = command.torques(*at)
             is_allowed = (np.abs(asked - before) < 4.0) & (asked > limits[0]) & (asked < limits[1])
             np.testing.assert_allclose(result[is_allowed], asked[is_allowed], rtol=1e-9)
-            is_near = (result < 0.91 * limits[0]) | (result > 0.91 * limits[1])
-            later = random_state(rng)
-            later = limited(command, state, before, 4.0, joints).torques(later.joint_positions, later.joint_velocities)
-            np.testing.assert_array_equal(later[is_near], result[is_near])
 
 
 def test_tilt():
@@ -293,6 +289,6 @@ def test_missed_deadlines_and_a_dead_program(policy):
     assert world.controller.reason == "all deadlines of 16 ms were missed"
     world.run(1)
     assert not world.robot.is_damping
-    for _ in range(ALLOWED + 1):
+    for _ in range(ALLOWED - 1):
         world.robot.step(Received())
     assert world.robot.is_damping and world.robot.watchdog_ticks

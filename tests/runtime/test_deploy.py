@@ -107,7 +107,7 @@ def test_over_the_wire_as_in_process(exported, tmp_path):
 
 
 def test_ctrl_c_in_the_farewell(exported, tmp_path, monkeypatch):
-    """It does not cut that short."""
+    """A first one is only noted."""
     close = Session.close
     monkeypatch.setattr(Session, "close", lambda self: (signal.raise_signal(signal.SIGINT), close(self)))
     assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[::2] == (0, "")

@@ -63,6 +63,9 @@ def test_an_earlier_policy(make_task, tmp_path):
         export(make_task, "go2_position", tmp_path, add)
     assert {path.name for path in (tmp_path / "out").rglob("*.*")} == {"policy.onnx", "policy.pt", "policy.yaml"}
     assert not [*(tmp_path / "out").glob("*/*")]
+    (tmp_path / "out" / "exported" / "policy.onnx").touch()
+    export(make_task, "go2_position", tmp_path, None)
+    assert (tmp_path / "out" / "exported" / "policy.onnx").exists()
     (tmp_path / "out" / "policy.yaml").unlink()
     (tmp_path / "out" / "params" / "deploy.yaml").touch()
     export(make_task, "go2_position", tmp_path, None)

@@ -135,10 +135,11 @@ def test_unattended(robot, reached):
     unattended = operator.Unattended(robot.controller)
     while does(robot)[0] != reached:
         unattended.look()
-    robot.controller.request(Mode.DAMPING)
-    for _ in range(2):
-        unattended.look()
-        assert does(robot)[0] == Mode.DAMPING
+    for mode in (Mode.DAMPING, Mode.STAND):
+        robot.controller.request(mode)
+        for _ in range(2):
+            unattended.look()
+            assert does(robot)[0] == mode
 
 
 def test_keys(robot, monkeypatch):

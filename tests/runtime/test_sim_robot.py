@@ -34,4 +34,4 @@ def test_refused(changed):
     assert "'tail_hip'" in error_of(SimRobot, changed(), [*JOINT_ORDER, "tail_hip"], RATE)
     motors = task_registry.get_cfgs("a1_position")[0].motors
     motors.chain, motors.network.layers = ["network", "ideal"], np.zeros((1, 1, 7)).tolist()
-    assert "a network of motors" in error_of(SimRobot, changed(), JOINT_ORDER, RATE, motors)
+    assert "a motor network" in error_of(SimRobot, changed(), JOINT_ORDER, RATE, motors)
