@@ -368,7 +368,7 @@ def test_faults():
     text = text_of(page, "## Brakes").replace("\n", " ")
     beyond = set(data[data["excess"] > 0.0]["fault"])
     assert beyond == {"joint too fast", "joint beyond its range"} and "only while a joint was set to another" in text
-    assert f"once after {data['ms'].max():.1f} ms" in text and (data["ms"] > 20.0).sum() == 1
+    assert data["ms"].max() < 20.0
 
 
 def test_kernels_of_an_update():
