@@ -37,7 +37,7 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--interface", required=True, help=hint)
     parser.add_argument("--domain", type=int, help="of DDS alone; default: 0, Unitree's")
     hint = "commands per second; default: the largest multiple of the policy's rate up to 500; "
-    hint += "sim_robot.py damps below 67"
+    hint += "sim_robot.py damps after 15 ms without one"
     parser.add_argument("--rate", type=float, help=hint)
     cli.add_command_arg(parser, "first", "stand still")
     hint = "obey JSON datagrams on a port of this machine, or of one of its addresses; docs/howto/run_on_robot.md"
