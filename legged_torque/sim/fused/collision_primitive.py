@@ -3,10 +3,12 @@
 import warp as wp
 
 from legged_torque.sim.fused.math import column
-from legged_torque.sim.fused.types import mat83, vec8
+from legged_torque.sim.fused.types import AnyPairContacts, mat23, mat83, vec8
 
-MAX_PAIR_CONTACTS = wp.constant(8)
+MAX_CORNERS = wp.constant(8)
+"""Of a polygon."""
 NEVER = wp.constant(1.0e30)
+TINY = wp.constant(1.0e-30)
 PARALLEL = wp.constant(1.0e-8)
 """Lines whose directions have less than this squared sine of an angle between them are parallel."""
 EDGE_NOISE = wp.constant(1.0e-7)
@@ -33,9 +35,19 @@ class PairContacts:
     """The contacts of two geoms: the first ``count`` entries."""
 
     count: wp.int32
-    dist: vec8  # negative [m]
-    pos: mat83  # midway between the surfaces
-    normal: mat83  # from the first geom to the second
+    dist: wp.vec2  # negative [m]
+    pos: mat23  # midway between the surfaces
+    normal: mat23  # from the first geom to the second
+
+
+@wp.struct
+class BoxContacts:
+    """The same, with room for those of two boxes; a struct of this size costs kernels without boxes a fifth."""
+
+    count: wp.int32
+    dist: vec8
+    pos: mat83
+    normal: mat83
 
 
 @wp.struct
@@ -47,9 +59,9 @@ class Polygon:
 
 
 @wp.func
-def add_contact(out: PairContacts, dist: float, pos: wp.vec3, normal: wp.vec3) -> PairContacts:
+def add_contact(out: AnyPairContacts, dist: float, pos: wp.vec3, normal: wp.vec3):
     """Return contacts with one more, if it is one."""
-    if dist < 0.0 and out.count < MAX_PAIR_CONTACTS:
+    if dist < 0.0 and out.count < len(out.dist):
         out.dist[out.count] = dist
         out.pos[out.count] = pos
         out.normal[out.count] = normal
@@ -58,7 +70,7 @@ def add_contact(out: PairContacts, dist: float, pos: wp.vec3, normal: wp.vec3) -
 
 
 @wp.func
-def add_spheres(out: PairContacts, a: wp.vec3, radius_a: float, b: wp.vec3, radius_b: float) -> PairContacts:
+def add_spheres(out: AnyPairContacts, a: wp.vec3, radius_a: float, b: wp.vec3, radius_b: float):
     """Return contacts with that of two spheres."""
     apart = b - a
     length = wp.length(apart)
@@ -70,7 +82,7 @@ def add_spheres(out: PairContacts, a: wp.vec3, radius_a: float, b: wp.vec3, radi
 
 
 @wp.func
-def add_sphere_box(out: PairContacts, centre: wp.vec3, radius: float, box: Shape) -> PairContacts:
+def add_sphere_box(out: AnyPairContacts, centre: wp.vec3, radius: float, box: Shape):
     """Return contacts with that of a sphere and a box."""
     local = wp.transpose(box.rot) * (centre - box.pos)
     apart = wp.max(-box.size, wp.min(box.size, local)) - local
@@ -88,9 +100,37 @@ def add_sphere_box(out: PairContacts, centre: wp.vec3, radius: float, box: Shape
 
 
 @wp.func
+def unit(k: int) -> wp.vec3:
+    """Return a unit vector along an axis."""
+    out = wp.vec3()
+    out[k] = 1.0
+    return out
+
+
+@wp.func
 def axis_of(shape: Shape) -> wp.vec3:
     """Return half of a capsule's axis, from its middle to an end."""
     return shape.size[1] * column(shape.rot, 2)
+
+
+@wp.func
+def between_capsules(a: Shape, b: Shape) -> bool:
+    """Return whether a plane across the line between two middles is between the surfaces."""
+    apart, reach = b.pos - a.pos, a.size[0] + b.size[0]
+    along = wp.abs(wp.dot(axis_of(a), apart)) + wp.abs(wp.dot(axis_of(b), apart))
+    return wp.length_sq(apart) - along > reach * wp.length(apart)
+
+
+@wp.func
+def between_capsule_and_box(a: Shape, box: Shape) -> bool:
+    """Return whether a plane is between the surfaces: along a face of the box, or along an edge and the axis."""
+    apart, axis = wp.transpose(box.rot) * (a.pos - box.pos), wp.transpose(box.rot) * axis_of(a)
+    gap = wp.max(wp.abs(apart) - wp.abs(axis) - box.size)
+    for k in range(3):
+        across = wp.cross(unit(k), axis)
+        over_edge = wp.abs(wp.dot(across, apart)) - wp.dot(wp.abs(across), box.size)
+        gap = wp.max(gap, over_edge / wp.max(wp.length(across), TINY))
+    return gap > a.size[0]
 
 
 @wp.func
@@ -118,30 +158,29 @@ def are_parallel(u: wp.vec3, v: wp.vec3) -> bool:
 
 
 @wp.func
-def sphere_sphere(a: Shape, b: Shape) -> PairContacts:
+def sphere_sphere(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contact of two spheres."""
-    return add_spheres(PairContacts(), a.pos, a.size[0], b.pos, b.size[0])
+    return add_spheres(out, a.pos, a.size[0], b.pos, b.size[0])
 
 
 @wp.func
-def sphere_capsule(a: Shape, b: Shape) -> PairContacts:
+def sphere_capsule(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contact of a sphere and a capsule."""
     axis = column(b.rot, 2)
     nearest = b.pos + wp.clamp(wp.dot(axis, a.pos - b.pos), -b.size[1], b.size[1]) * axis
-    return add_spheres(PairContacts(), a.pos, a.size[0], nearest, b.size[0])
+    return add_spheres(out, a.pos, a.size[0], nearest, b.size[0])
 
 
 @wp.func
-def sphere_box(a: Shape, b: Shape) -> PairContacts:
+def sphere_box(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contact of a sphere and a box."""
-    return add_sphere_box(PairContacts(), a.pos, a.size[0], b)
+    return add_sphere_box(out, a.pos, a.size[0], b)
 
 
 @wp.func
-def capsule_capsule(a: Shape, b: Shape) -> PairContacts:
+def capsule_capsule(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contacts of two capsules: one, or one at each end of their overlap if parallel."""
     u, v, apart = axis_of(a), axis_of(b), b.pos - a.pos
-    out = PairContacts()
     if are_parallel(u, v):
         for end in range(2):
             at = nearest_from(2.0 * float(end) - 1.0, u, v, apart)
@@ -216,11 +255,11 @@ def nearest_on_axis(pos: wp.vec3, half: wp.vec3, size: wp.vec3) -> OnBox:
 
 
 @wp.func
-def capsule_box(a: Shape, b: Shape) -> PairContacts:
+def capsule_box(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contacts of a capsule and a box: where they are nearest, and the last point that is over the box."""
     pos, half = wp.transpose(b.rot) * (a.pos - b.pos), wp.transpose(b.rot) * axis_of(a)
     best = nearest_on_axis(pos, half, b.size)
-    out = add_sphere_box(PairContacts(), a.pos + best.along * axis_of(a), a.size[0], b)
+    out = add_sphere_box(out, a.pos + best.along * axis_of(a), a.size[0], b)
     if best.way != 0.0:
         left = 1.0 - best.way * best.along
         for k in range(3):
@@ -229,14 +268,6 @@ def capsule_box(a: Shape, b: Shape) -> PairContacts:
             if until_end > 0.0:
                 left = wp.min(left, until_end)
         out = add_sphere_box(out, a.pos + (best.along + best.way * left) * axis_of(a), a.size[0], b)
-    return out
-
-
-@wp.func
-def unit(k: int) -> wp.vec3:
-    """Return a unit vector along an axis."""
-    out = wp.vec3()
-    out[k] = 1.0
     return out
 
 
@@ -263,10 +294,10 @@ def clip(polygon: Polygon, k: int, side: float, limit: float) -> Polygon:
     for i in range(polygon.count):
         corner = polygon.corner[i]
         before, after = side * last[k] - limit, side * corner[k] - limit
-        if before * after < 0.0 and out.count < MAX_PAIR_CONTACTS:
+        if before * after < 0.0 and out.count < MAX_CORNERS:
             out.corner[out.count] = last + before / (before - after) * (corner - last)
             out.count += 1
-        if after <= 0.0 and out.count < MAX_PAIR_CONTACTS:
+        if after <= 0.0 and out.count < MAX_CORNERS:
             out.corner[out.count] = corner
             out.count += 1
         last = corner
@@ -274,7 +305,7 @@ def clip(polygon: Polygon, k: int, side: float, limit: float) -> Polygon:
 
 
 @wp.func
-def face_contacts(a: Shape, b: Shape, f: int, sign: float) -> PairContacts:
+def face_contacts(out: AnyPairContacts, a: Shape, b: Shape, f: int, sign: float):
     """Return the contacts of a face of ``a`` across its axis ``f`` with the face of ``b`` that is turned to it.
 
     They are the corners of that face, clipped by the sides of the first; ``sign`` is that of their normals.
@@ -292,7 +323,6 @@ def face_contacts(a: Shape, b: Shape, f: int, sign: float) -> PairContacts:
         face.corner[i] = wp.vec3(corner[x], corner[y], side * corner[f] - a.size[f])  # the last one is the distance
     for i in range(4):
         face = clip(face, i // 2, wp.where(i % 2 == 0, 1.0, -1.0), wp.where(i < 2, a.size[x], a.size[y]))
-    out = PairContacts()
     least = DUPLICATE * (a.size[x] * a.size[x] + a.size[y] * a.size[y])
     for i in range(face.count):
         corner = face.corner[i]
@@ -310,7 +340,9 @@ def face_contacts(a: Shape, b: Shape, f: int, sign: float) -> PairContacts:
 
 
 @wp.func
-def edge_contact(a: Shape, b: Shape, i: int, j: int, axis: wp.vec3, rot: wp.mat33, apart: wp.vec3) -> PairContacts:
+def edge_contact(
+    out: AnyPairContacts, a: Shape, b: Shape, i: int, j: int, axis: wp.vec3, rot: wp.mat33, apart: wp.vec3
+):
     """Return the contact of two edges along the axes ``i`` and ``j`` of the boxes, across an axis from a to b."""
     u, v = a.size[i] * unit(i), b.size[j] * column(rot, j)
     turned = wp.transpose(rot) * axis
@@ -325,11 +357,11 @@ def edge_contact(a: Shape, b: Shape, i: int, j: int, axis: wp.vec3, rot: wp.mat3
     first += at[0] * u
     second += at[1] * v
     dist = wp.dot(second - first, axis)
-    return add_contact(PairContacts(), dist, a.pos + a.rot * (0.5 * (first + second)), a.rot * axis)
+    return add_contact(out, dist, a.pos + a.rot * (0.5 * (first + second)), a.rot * axis)
 
 
 @wp.func
-def box_box(a: Shape, b: Shape) -> PairContacts:
+def box_box(out: AnyPairContacts, a: Shape, b: Shape):
     """Return the contacts of two boxes: of a face, or of two edges, where they are least in each other."""
     rot, apart = wp.transpose(a.rot) * b.rot, wp.transpose(a.rot) * (b.pos - a.pos)
     slack = SLACK * (a.size[0] + a.size[1] + a.size[2] + b.size[0] + b.size[1] + b.size[2])
@@ -342,7 +374,7 @@ def box_box(a: Shape, b: Shape) -> PairContacts:
             reach = wp.dot(a.size, wp.abs(axis)) + wp.dot(b.size, wp.abs(wp.transpose(rot) * axis))
             dist = wp.abs(wp.dot(axis, apart)) - reach
             if dist > slack:
-                return PairContacts()
+                return out
             if number < 6 and dist > best:
                 face = number
                 of_face = dist
@@ -354,8 +386,8 @@ def box_box(a: Shape, b: Shape) -> PairContacts:
     is_like_face = wp.abs(wp.dot(axis, separating_axis(face, rot))) > LIKE_FACE
     if chosen < 6 or (is_like_face and best < of_face + BETTER * wp.abs(of_face)):
         if face < 3:
-            return face_contacts(a, b, face, 1.0)
-        return face_contacts(b, a, face - 3, -1.0)
+            return face_contacts(out, a, b, face, 1.0)
+        return face_contacts(out, b, a, face - 3, -1.0)
     if wp.dot(axis, apart) < 0.0:
         axis = -axis
-    return edge_contact(a, b, (chosen - 6) // 3, (chosen - 6) % 3, axis, rot, apart)
+    return edge_contact(out, a, b, (chosen - 6) // 3, (chosen - 6) % 3, axis, rot, apart)

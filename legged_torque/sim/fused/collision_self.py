@@ -9,9 +9,11 @@ import warp as wp
 
 from legged_torque.sim.fused.collision import BOX, CAPSULE, contact_tangent
 from legged_torque.sim.fused.collision_primitive import (
+    BoxContacts,
     PairContacts,
     Shape,
-    axis_of,
+    between_capsule_and_box,
+    between_capsules,
     box_box,
     capsule_box,
     capsule_capsule,
@@ -170,18 +172,20 @@ def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
 
 
 @wp.func
-def is_beside(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
-    """Return whether a sphere or capsule lies beyond one of the faces of a box; False for other pairs.
+def are_separate(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
+    """Return whether a plane is between two geoms; False if none of a few is. Not for two boxes.
 
     A sphere counts as a capsule, which is longer if the file gives it a second size.
     """
-    beside = bool(False)
-    if model.geom_type[geoms[1]] == BOX and model.geom_type[geoms[0]] != BOX:
-        shape, box = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-        apart, axis = wp.transpose(box.rot) * (shape.pos - box.pos), wp.transpose(box.rot) * axis_of(shape)
-        outside = wp.abs(apart) - wp.abs(axis) - box.size
-        beside = wp.max(outside) > shape.size[0]
-    return beside
+    is_box = model.geom_type[geoms[1]] == BOX
+    separate = bool(False)
+    if not (is_box and model.geom_type[geoms[0]] == BOX):
+        a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
+        if is_box:
+            separate = between_capsule_and_box(a, b)
+        else:
+            separate = between_capsules(a, b)
+    return separate
 
 
 @wp.func
@@ -205,7 +209,7 @@ def write_near(model: Model, selves: SelfContacts, world: int, thread: int, thre
         while near != 0:
             bit = lowest_bit(near)
             near ^= 1 << bit
-            if not is_beside(model, selves, world, selves.pair[start + bit * threads]):
+            if not are_separate(model, selves, world, selves.pair[start + bit * threads]):
                 may_touch |= 1 << bit
                 number += 1.0
         found = int(group_sum(number, threads))
@@ -255,6 +259,7 @@ def make_self_contact(
 @functools.cache
 def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.Function:
     """Return ``find_self_contacts`` for a number of threads per world; it has no code for other pairs of types."""
+    Contacts = BoxContacts if (BOX, BOX) in kinds else PairContacts
 
     @wp.func
     def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> Touching:
@@ -268,7 +273,7 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
         near = write_near(model, selves, world, thread, wp.static(threads))
         sync_group(wp.static(threads))
         for start in range(0, near, wp.static(threads)):
-            touch = PairContacts()
+            touch = Contacts()
             pair, geoms = int(0), wp.vec2i(0, 0)
             if start + thread < near:
                 pair = selves.near[start + thread, world]
@@ -277,7 +282,7 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
                 a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
                 for i in range(wp.static(len(kinds))):
                     if first == wp.static(kinds[i][0]) and second == wp.static(kinds[i][1]):
-                        touch = wp.static(_COLLIDE[kinds[i]])(a, b)
+                        touch = wp.static(_COLLIDE[kinds[i]])(touch, a, b)
             new = int(group_sum(float(touch.count), wp.static(threads)))
             if new > 0:
                 place = end + int(sum_before(float(touch.count), thread, wp.static(threads)))

@@ -14,6 +14,7 @@ vec5 = wp.types.vector(length=5, dtype=wp.float32)
 vec6 = wp.types.vector(length=6, dtype=wp.float32)
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
+mat23 = wp.types.matrix(shape=(2, 3), dtype=wp.float32)
 mat83 = wp.types.matrix(shape=(8, 3), dtype=wp.float32)
 
 AnyVector = AnyMatrix = AnyColumns = Any
@@ -22,6 +23,8 @@ AnyBranch = AnyLinks = AnyRows = Any
 """``Branch``, ``Links`` and ``JointRows`` of :func:`branch_types`."""
 AnyContacts = Any
 """``PlaneContacts`` with a plane, ``MapContacts`` with a height map."""
+AnyPairContacts = Any
+"""``PairContacts``, or ``BoxContacts`` if two boxes may touch."""
 
 
 @wp.struct
