@@ -1,18 +1,16 @@
 """Unitree's messages for Go2 and newer robots: what goes over the wire, and its CRC.
 
 Names, order and sizes of the fields are those of Unitree's SDK (unitree_sdk2_python, ``idl/unitree_go/msg/dds_``), as
-DDS connects only sides whose types are the same. Structure and CRC: ``utils/crc.py`` there.
+DDS connects only sides whose types are the same. Structure and CRC: ``utils/crc.py`` there. A message is the list of
+its numbers: objects for all its parts would take half of the control loop's time.
 """
 
 import struct
 import zlib
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
-from operator import attrgetter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import make_idl_struct
 from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
 from numpy.typing import ArrayLike
 
@@ -37,151 +35,145 @@ class CrcError(MessageError):
     """A message that was damaged on its way."""
 
 
-def _zeros(name: str, **members: Any) -> Any:
-    """Return a type whose numbers are 0 at first, of types by member; an array's have a type and a length."""
-    kinds = {member: array[kind] if isinstance(kind, tuple) else kind for member, kind in members.items()}
-    struct = make_idl_struct(name, f"unitree_go.msg.dds_.{name}", kinds, dataclassify=False)
-    for member, kind in members.items():
-        setattr(struct, member, (0,) * kind[1] if isinstance(kind, tuple) else 0)
-    return dataclass(struct)
+class Message:
+    """A message: ``message["imu_state.gyroscope"]`` are its numbers of that name; of motors, those of the legs.
 
-
-@dataclass
-class MotorCmd_(IdlStruct, typename="unitree_go.msg.dds_.MotorCmd_"):
-    """Command of one drive; at first, of no torque."""
-
-    mode: uint8 = SERVO
-    q: float32 = NO_POSITION
-    dq: float32 = NO_VELOCITY
-    tau: float32 = 0.0
-    kp: float32 = 0.0
-    kd: float32 = 0.0
-    reserve: array[uint32, 3] = (0,) * 3
-
-
-BmsCmd_ = _zeros("BmsCmd_", off=uint8, reserve=(uint8, 3))
-
-
-@dataclass
-class LowCmd_(IdlStruct, typename="unitree_go.msg.dds_.LowCmd_"):
-    """Command of a robot, on the topic rt/lowcmd.
-
-    Unitree's programs leave ``reserve`` 0; ours number their messages there, from 1.
+    Attributes:
+        numbers: All of them, in order.
+        places: Their indices or slices, by name; of an array of each motor, that of its first number.
+        size: How many there are.
+        blank: Those of a message that says nothing.
+        c_layout: The C structure of Unitree's SDK, little endian; the last four bytes are the CRC.
+        cdr_layouts: DDS's own form, which has less padding, by the first bytes that say its order of bytes.
+        sample_info: What cyclonedds knows about a message that has come.
     """
 
-    head: array[uint8, 2] = HEAD
-    level_flag: uint8 = LOW_LEVEL
-    frame_reserve: uint8 = 0
-    sn: array[uint32, 2] = (0,) * 2
-    version: array[uint32, 2] = (0,) * 2
-    bandwidth: uint16 = 0
-    motor_cmd: array[MotorCmd_, SLOTS] = field(default_factory=lambda: [MotorCmd_() for _ in range(SLOTS)])
-    bms_cmd: BmsCmd_ = field(default_factory=BmsCmd_)
-    wireless_remote: array[uint8, 40] = (0,) * 40
-    led: array[uint8, 12] = (0,) * 12
-    fan: array[uint8, 2] = (0,) * 2
-    gpio: uint8 = 0
-    reserve: uint32 = 0
-    crc: uint32 = 0
+    places: ClassVar[dict[str, Any]]
+    size: ClassVar[int]
+    blank: ClassVar[list[Any]]
+    c_layout: ClassVar[struct.Struct]
+    cdr_layouts: ClassVar[dict[bytes, struct.Struct]]
+    sample_info: Any
+
+    def __init__(self, numbers: list[Any] | None = None) -> None:
+        """Make a message of all its numbers, or one without any but those that are always the same."""
+        self.numbers = numbers or self.blank.copy()
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a number, or a list of them."""
+        return self.numbers[self.places[name]]
+
+    def __setitem__(self, name: str, values: Any) -> None:
+        """Set a number, or as many as there are."""
+        self.numbers[self.places[name]] = values
+
+    def serialize(self, use_version_2: bool | None = None) -> bytes:
+        """Return the message in DDS's form, as cyclonedds calls it."""
+        return _CDR + self.cdr_layouts[_CDR[:2]].pack(*self.numbers)
+
+    @classmethod
+    def deserialize(cls, data: bytes) -> "Message":
+        """Return a message from DDS's form; from any other, a blank one, whose CRC is wrong."""
+        layout = cls.cdr_layouts.get(data[:2])
+        if layout is None or len(data) < len(_CDR) + layout.size:
+            return cls()
+        return cls(list(layout.unpack_from(data, len(_CDR))))
 
 
+def _type(name: str, **members: Any) -> Any:
+    """Return a type of DDS with members of some types; an array has a type and a length."""
+    kinds = {member: array[kind] if isinstance(kind, tuple) else kind for member, kind in members.items()}
+    kind = make_idl_struct(name, f"unitree_go.msg.dds_.{name}", kinds, dataclassify=False)
+    kind.places, place = {}, 0
+    for member, inner in members.items():
+        inner, length = inner if isinstance(inner, tuple) else (inner, 0)
+        size = getattr(inner, "size", 1)
+        kind.places[member] = slice(place, place + size * length) if length else place
+        for part, index in getattr(inner, "places", {}).items():
+            first = place + getattr(index, "start", index)
+            of_legs = slice(first, first + size * len(JOINT_ORDER), size)
+            alone = slice(first, place + index.stop) if isinstance(index, slice) else first
+            kind.places[f"{member}.{part}"] = of_legs if length else alone
+        place += size * max(length, 1)
+    kind.size = place
+    return kind
+
+
+MotorCmd_ = _type(
+    "MotorCmd_", mode=uint8, q=float32, dq=float32, tau=float32, kp=float32, kd=float32, reserve=(uint32, 3)
+)
+BmsCmd_ = _type("BmsCmd_", off=uint8, reserve=(uint8, 3))
 _TRUNK = {"quaternion": (float32, 4), "gyroscope": (float32, 3), "accelerometer": (float32, 3), "rpy": (float32, 3)}
-IMUState_ = _zeros("IMUState_", **_TRUNK, temperature=uint8)
+IMUState_ = _type("IMUState_", **_TRUNK, temperature=uint8)
 _MOTOR = dict.fromkeys(("q", "dq", "ddq", "tau_est", "q_raw", "dq_raw", "ddq_raw"), float32)
-MotorState_ = _zeros("MotorState_", mode=uint8, **_MOTOR, temperature=uint8, lost=uint32, reserve=(uint32, 2))
+MotorState_ = _type("MotorState_", mode=uint8, **_MOTOR, temperature=uint8, lost=uint32, reserve=(uint32, 2))
 """Unitree names no error flags for Go2; here they are ``reserve[0]``."""
 _BATTERY = dict.fromkeys(("version_high", "version_low", "status", "soc"), uint8) | {"current": int32, "cycle": uint16}
-BmsState_ = _zeros("BmsState_", **_BATTERY, bq_ntc=(uint8, 2), mcu_ntc=(uint8, 2), cell_vol=(uint16, 15))
+BmsState_ = _type("BmsState_", **_BATTERY, bq_ntc=(uint8, 2), mcu_ntc=(uint8, 2), cell_vol=(uint16, 15))
+_START = {"head": (uint8, 2), "level_flag": uint8, "frame_reserve": uint8}
+_START |= {"sn": (uint32, 2), "version": (uint32, 2), "bandwidth": uint16}
+LowCmd_: type[Message] = _type(
+    "LowCmd_",
+    **_START,
+    motor_cmd=(MotorCmd_, SLOTS),
+    bms_cmd=BmsCmd_,
+    wireless_remote=(uint8, 40),
+    led=(uint8, 12),
+    fan=(uint8, 2),
+    gpio=uint8,
+    reserve=uint32,
+    crc=uint32,
+)
+"""Command of a robot, on the topic rt/lowcmd.
 
+Unitree's programs leave ``reserve`` 0; ours number their messages there, from 1.
+"""
+LowState_: type[Message] = _type(
+    "LowState_",
+    **_START,
+    imu_state=IMUState_,
+    motor_state=(MotorState_, SLOTS),
+    bms_state=BmsState_,
+    foot_force=(int16, 4),
+    foot_force_est=(int16, 4),
+    tick=uint32,
+    wireless_remote=(uint8, 40),
+    bit_flag=uint8,
+    adc_reel=float32,
+    temperature_ntc1=uint8,
+    temperature_ntc2=uint8,
+    power_v=float32,
+    power_a=float32,
+    fan_frequency=(uint16, 4),
+    reserve=uint32,
+    crc=uint32,
+)
+"""State of a robot, on the topic rt/lowstate."""
 
-@dataclass
-class LowState_(IdlStruct, typename="unitree_go.msg.dds_.LowState_"):
-    """State of a robot, on the topic rt/lowstate."""
-
-    head: array[uint8, 2] = HEAD
-    level_flag: uint8 = LOW_LEVEL
-    frame_reserve: uint8 = 0
-    sn: array[uint32, 2] = (0,) * 2
-    version: array[uint32, 2] = (0,) * 2
-    bandwidth: uint16 = 0
-    imu_state: IMUState_ = field(default_factory=IMUState_)
-    motor_state: array[MotorState_, SLOTS] = field(default_factory=lambda: [MotorState_(SERVO) for _ in range(SLOTS)])
-    bms_state: BmsState_ = field(default_factory=BmsState_)
-    foot_force: array[int16, 4] = (0,) * 4
-    foot_force_est: array[int16, 4] = (0,) * 4
-    tick: uint32 = 0
-    wireless_remote: array[uint8, 40] = (0,) * 40
-    bit_flag: uint8 = 0
-    adc_reel: float32 = 0.0
-    temperature_ntc1: uint8 = 0
-    temperature_ntc2: uint8 = 0
-    power_v: float32 = 0.0
-    power_a: float32 = 0.0
-    fan_frequency: array[uint16, 4] = (0,) * 4
-    reserve: uint32 = 0
-    crc: uint32 = 0
-
-
-_FORMATS: dict[type, str] = {
-    LowCmd_: "<4B4IH2x" + "B3x5f3I" * SLOTS + "4B55Bx2I",
-    LowState_: "<4B4IH2x" + "13fB3x" + "B3x7fB3x3I" * SLOTS + "4BiH4B15H8hI41B3xf2B2x2f4H2I",
-}
-"""The messages as C structures, little endian: 812 and 1180 bytes, the last four of which are the CRC."""
-_LAYOUTS = {kind: struct.Struct(text) for kind, text in _FORMATS.items()}
-_UNPADDED = {kind: text.replace("H2xB3x", "HBx").replace("B3xB3x", "BB2x") for kind, text in _FORMATS.items()}
-_WIRE = {kind: struct.Struct(text) for kind, text in _UNPADDED.items()}
-"""The same in DDS's own form, CDR, which begins with _CDR and has less padding."""
 _CDR = b"\0\1\0\0"
-_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
-_MEMBERS = {
-    kind: attrgetter(*(member.name for member in fields(kind)))
-    for kind in (MotorCmd_, BmsCmd_, LowCmd_, IMUState_, MotorState_, BmsState_, LowState_)
+"""How DDS's form begins: little endian."""
+_ORDERS = {_CDR[:2]: "<", b"\0\0": ">"}
+_IDLE = [SERVO, NO_POSITION, NO_VELOCITY, *[0] * 6]  # command of a drive that gives no torque
+_LAYOUTS = {
+    LowCmd_: "4B4IH2x" + "B3x5f3I" * SLOTS + "4B55Bx2I",
+    LowState_: "4B4IH2x" + "13fB3x" + "B3x7fB3x3I" * SLOTS + "4BiH4B15H8hI41B3xf2B2x2f4H2I",
 }
-"""What reads all fields of a message or a part of one, in order."""
+_STATES = [0] * IMUState_.size + [SERVO, *[0] * (MotorState_.size - 1)] * SLOTS
+_PARTS: dict[Any, list[Any]] = {LowCmd_: _IDLE * SLOTS, LowState_: _STATES}
+for _kind, _layout in _LAYOUTS.items():
+    for _name in ("__init__", "__getitem__", "__setitem__", "serialize", "deserialize"):
+        setattr(_kind, _name, vars(Message)[_name])  # cyclonedds would take a base class for a part of the message
+    _unpadded = _layout.replace("H2xB3x", "HBx").replace("B3xB3x", "BB2x")
+    _kind.c_layout = struct.Struct("<" + _layout)
+    _kind.cdr_layouts = {start: struct.Struct(order + _unpadded) for start, order in _ORDERS.items()}
+    _known = [*HEAD, LOW_LEVEL, *[0] * 6, *_PARTS[_kind]]
+    _kind.blank = _known + [0] * (_kind.size - len(_known))
+_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
-def _numbers(part: IdlStruct) -> Iterator[Any]:
-    """Yield all numbers of a message or a part of one, in order."""
-    for value in _MEMBERS[type(part)](part):
-        if isinstance(value, (int, float)):
-            yield value
-        elif isinstance(value, IdlStruct):
-            yield from _numbers(value)
-        elif isinstance(value[0], IdlStruct):
-            for inner in value:
-                yield from _numbers(inner)
-        else:
-            yield from value
-
-
-def _filled(blank: Any, numbers: Iterator[Any]) -> Any:
-    """Return a message like a blank one, or a part of it, with numbers in order."""
-    if isinstance(blank, (int, float)):
-        return next(numbers)
-    if isinstance(blank, IdlStruct):
-        return type(blank)(*[_filled(member, numbers) for member in _MEMBERS[type(blank)](blank)])
-    return [_filled(each, numbers) for each in blank]
-
-
-def _serialize(self: Any, use_version_2: bool | None = None) -> bytes:
-    """Do what cyclonedds does in Python, in a fourth of the time."""
-    return _CDR + _WIRE[type(self)].pack(*_numbers(self))
-
-
-def _deserialize(kind: Any, data: bytes) -> Any:
-    """Do what cyclonedds does in Python, in a third of the time; or leave other forms of CDR to it."""
-    if data[:2] != _CDR[:2] or len(data) < len(_CDR) + _WIRE[kind].size:
-        return kind.__idl__.deserialize(data)
-    return _filled(kind(), iter(_WIRE[kind].unpack_from(data, len(_CDR))))
-
-
-for _kind in _WIRE:
-    _kind.serialize, _kind.deserialize = _serialize, classmethod(_deserialize)
-
-
-def packed(message: LowCmd_ | LowState_) -> bytes:
+def packed(message: Message) -> bytes:
     """Return a message as the C structure of Unitree's SDK, over which the CRC runs."""
-    return _LAYOUTS[type(message)].pack(*_numbers(message))
+    return message.c_layout.pack(*message.numbers)
 
 
 def crc(structure: bytes) -> int:
@@ -205,69 +197,67 @@ def _finite(name: str, values: ArrayLike, length: int = len(JOINT_ORDER)) -> np.
     return rounded
 
 
-def _check(message: LowCmd_ | LowState_, modes: list[int]) -> None:
-    """Raise MessageError unless CRC, head and the modes of the legs' motors are right."""
-    if message.crc != crc(packed(message)):
+def _check(message: Message, motors: str) -> None:
+    """Raise MessageError unless CRC, head and the modes of the legs' ``motors`` are right."""
+    if message["crc"] != crc(packed(message)):
         raise CrcError("wrong CRC")
-    if tuple(message.head) == UNSET and isinstance(message, LowState_):
+    head = tuple(message["head"])
+    if head == UNSET and isinstance(message, LowState_):
         return
-    if tuple(message.head) != HEAD:
-        raise MessageError(f"the head is {bytes(message.head).hex()}, not {bytes(HEAD).hex()}: another protocol")
-    wrong = [f"{joint} {mode}" for joint, mode in zip(JOINT_ORDER, modes, strict=True) if mode != SERVO]
+    if head != HEAD:
+        raise MessageError(f"the head is {bytes(head).hex()}, not {bytes(HEAD).hex()}: another protocol")
+    modes = zip(JOINT_ORDER, message[f"{motors}.mode"], strict=True)
+    wrong = [f"{joint} {mode}" for joint, mode in modes if mode != SERVO]
     if wrong:
         raise MessageError(f"motors are not in mode {SERVO}: {', '.join(wrong)}")
 
 
-def encode_command(command: MotorCommand, number: int) -> LowCmd_:
+def encode_command(command: MotorCommand, number: int) -> Message:
     """Return the message of a command of the joints in JOINT_ORDER, in float32, with a number below 2 ** 32.
 
     Raises MessageError if a value is not finite, or there are not twelve.
     """
-    message = LowCmd_(reserve=number)
-    columns = [_finite(name, getattr(command, name)) for name in COMMANDED]
-    for motor, row in zip(message.motor_cmd, np.stack(columns, axis=1).tolist(), strict=False):
-        motor.tau, motor.q, motor.dq, motor.kp, motor.kd = row
-    message.crc = crc(packed(message))
+    message = LowCmd_()
+    message["reserve"] = number
+    for name in COMMANDED:
+        message[f"motor_cmd.{name}"] = _finite(name, getattr(command, name)).tolist()
+    message["crc"] = crc(packed(message))
     return message
 
 
-def decode_command(message: LowCmd_) -> MotorCommand:
+def decode_command(message: Message) -> MotorCommand:
     """Return the command of a message, float32; raises MessageError, or CrcError, if it is not to be obeyed."""
-    motors = message.motor_cmd[: len(JOINT_ORDER)]
-    _check(message, [motor.mode for motor in motors])
-    if message.level_flag != LOW_LEVEL:
-        raise MessageError(f"the level flag is {message.level_flag:#x}, not {LOW_LEVEL:#x}: not for the motors")
-    return MotorCommand(**{name: _finite(name, [getattr(motor, name) for motor in motors]) for name in COMMANDED})
+    _check(message, "motor_cmd")
+    if message["level_flag"] != LOW_LEVEL:
+        raise MessageError(f"the level flag is {message['level_flag']:#x}, not {LOW_LEVEL:#x}: not for the motors")
+    return MotorCommand(**{name: _finite(name, message[f"motor_cmd.{name}"]) for name in COMMANDED})
 
 
-def encode_state(state: RobotState) -> LowState_:
+def encode_state(state: RobotState) -> Message:
     """Return the message of a state of the joints in JOINT_ORDER, in float32, temperatures in whole degrees, 0 to 255.
 
     Raises MessageError if a number is not finite, or there are not as many as RobotState says.
     """
-    message = LowState_(tick=state.tick * STATE_PERIOD % 2**32)
-    message.imu_state.quaternion = _finite("quaternion", state.quaternion, 4).tolist()
-    message.imu_state.gyroscope = _finite("angular_velocity", state.angular_velocity, 3).tolist()
+    message = LowState_()
+    message["tick"] = state.tick * STATE_PERIOD % 2**32
+    message["imu_state.quaternion"] = _finite("quaternion", state.quaternion, 4).tolist()
+    message["imu_state.gyroscope"] = _finite("angular_velocity", state.angular_velocity, 3).tolist()
     columns = {member: _finite(name, getattr(state, name)) for name, member in MEASURED.items()}
     columns["temperature"] = np.clip(np.rint(columns["temperature"]), 0, 255).astype(np.uint8)
+    columns["reserve"] = np.asarray(state.errors, np.uint32)
     for member, column in columns.items():
-        for motor, value in zip(message.motor_state, column.tolist(), strict=False):
-            setattr(motor, member, value)
-    for motor, flags in zip(message.motor_state, np.asarray(state.errors, np.uint32).tolist(), strict=False):
-        motor.reserve = (flags, 0)
-    message.crc = crc(packed(message))
+        message[f"motor_state.{member}"] = column.tolist()
+    message["crc"] = crc(packed(message))
     return message
 
 
-def decode_state(message: LowState_) -> RobotState:
+def decode_state(message: Message) -> RobotState:
     """Return the state of a message, float32; raises MessageError, or CrcError, if it is not to be believed."""
-    motors = message.motor_state[: len(JOINT_ORDER)]
-    _check(message, [motor.mode for motor in motors])
-    columns = {name: [getattr(motor, member) for motor in motors] for name, member in MEASURED.items()}
+    _check(message, "motor_state")
     return RobotState(
-        tick=message.tick // STATE_PERIOD,
-        quaternion=_finite("quaternion", message.imu_state.quaternion, 4),
-        angular_velocity=_finite("angular_velocity", message.imu_state.gyroscope, 3),
-        errors=np.array([motor.reserve[0] for motor in motors], np.uint32),
-        **{name: _finite(name, column) for name, column in columns.items()},
+        tick=message["tick"] // STATE_PERIOD,
+        quaternion=_finite("quaternion", message["imu_state.quaternion"], 4),
+        angular_velocity=_finite("angular_velocity", message["imu_state.gyroscope"], 3),
+        errors=np.array(message["motor_state.reserve"], np.uint32),
+        **{name: _finite(name, message[f"motor_state.{member}"]) for name, member in MEASURED.items()},
     )

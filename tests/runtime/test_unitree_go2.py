@@ -2,6 +2,8 @@
 
 import dataclasses
 import struct
+from types import SimpleNamespace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ import pytest
 pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
 
 from cyclonedds.idl import Endianness
+from cyclonedds.idl.types import array
 
 from legged_torque.runtime import unitree_go2 as go2
 from legged_torque.runtime.interface import MotorCommand, RobotState
@@ -66,10 +69,19 @@ def test_bytes_of_a_command(command):
     told = zip(command.q, command.dq, command.tau, command.kp, command.kd, strict=True)
     motors = [(1, *numbers, 0, 0, 0) for numbers in told]
     motors += [(1, 2.146e9, 16000.0, 0.0, 0.0, 0.0, 0, 0, 0)] * 8
-    numbers = [0xFE, 0xEF, 0xFF, *[0] * 6, *[number for motor in motors for number in motor], *[0] * 59, 9, message.crc]
+    numbers = [
+        0xFE,
+        0xEF,
+        0xFF,
+        *[0] * 6,
+        *[number for motor in motors for number in motor],
+        *[0] * 59,
+        9,
+        message["crc"],
+    ]
     expected = struct.pack("<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55Bx2I", *numbers)
     assert go2.packed(message) == expected and len(expected) == 812
-    assert message.crc == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
+    assert message["crc"] == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
 
 
 def test_bytes_of_a_state(state):
@@ -81,23 +93,49 @@ def test_bytes_of_a_state(state):
     ends = [(int(t), 0, int(e), 0) for t, e in zip(state.temperatures, state.errors, strict=True)] + [(0, 0, 0, 0)] * 8
     moving = [number for motor, end in zip(motors, ends, strict=True) for number in (*motor, *end)]
     battery_and_feet = [0] * (4 + 2 + 4 + 15 + 8)
-    rest = [14, *[0] * 41, 0.0, 0, 0, 0.0, 0.0, *[0] * 4, 0, message.crc]
+    rest = [14, *[0] * 41, 0.0, 0, 0, 0.0, 0.0, *[0] * 4, 0, message["crc"]]
     layout = "<4B4IH2x" + "13fb3x" + "B3x7fb3x3I" * 20 + "4BiH4b15H" + "8hI41B3xf2b2x2f4h2I"
     expected = struct.pack(layout, 0xFE, 0xEF, 0xFF, *[0] * 6, *imu, *moving, *battery_and_feet, *rest)
     assert go2.packed(message) == expected and len(expected) == 1180
-    assert message.crc == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
+    assert message["crc"] == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
+
+
+def as_objects(kind, numbers):
+    """The next numbers as a message of a type, or as a part of one, in the form that cyclonedds serializes itself."""
+    if not hasattr(kind, "places"):
+        return next(numbers)
+    members = {}
+    for name, hint in kind.__annotations__.items():
+        several = get_args(hint)[-1] if get_args(hint) else None
+        if isinstance(several, array):
+            members[name] = [as_objects(several.subtype, numbers) for _ in range(several.length)]
+        else:
+            members[name] = as_objects(hint, numbers)
+    return SimpleNamespace(**members)
 
 
 @pytest.mark.parametrize("kind", [go2.LowCmd_, go2.LowState_])
 def test_wire_form(kind, rng):
     """Messages of random numbers have the bytes that cyclonedds itself makes, and come back; big-endian ones, too."""
     for _ in range(50):
-        numbers = go2._WIRE[kind].unpack(rng.integers(0, 128, go2._WIRE[kind].size, dtype=np.uint8).tobytes())
-        message = go2._filled(kind(), iter(numbers))
-        data = message.serialize()
-        assert data == kind.__idl__.serialize(message, use_version_2=False)
-        for form in (data, kind.__idl__.serialize(message, endianness=Endianness.Big, use_version_2=False)):
-            assert tuple(go2._numbers(kind.deserialize(form))) == numbers
+        numbers = kind.c_layout.unpack(rng.integers(0, 128, kind.c_layout.size, dtype=np.uint8).tobytes())
+        data, objects = kind(list(numbers)).serialize(), as_objects(kind, iter(numbers))
+        assert data == kind.__idl__.serialize(objects, use_version_2=False)
+        for form in (data, kind.__idl__.serialize(objects, endianness=Endianness.Big, use_version_2=False)):
+            assert tuple(kind.deserialize(form).numbers) == numbers
+        for damaged in (data[:-1], b"\0\3" + data[2:], b""):
+            with pytest.raises(go2.CrcError):
+                (go2.decode_state if kind is go2.LowState_ else go2.decode_command)(kind.deserialize(damaged))
+
+
+def test_names_of_numbers(rng):
+    """Names lead to the numbers that they have in the SDK's messages; of motors, to those of the legs."""
+    numbers = list(range(go2.LowState_.size))
+    message, objects = go2.LowState_(numbers), as_objects(go2.LowState_, iter(numbers))
+    assert message["tick"] == objects.tick and message["crc"] == objects.crc == numbers[-1]
+    assert message["imu_state.gyroscope"] == objects.imu_state.gyroscope
+    assert message["motor_state.q"] == [motor.q for motor in objects.motor_state[:12]]
+    assert message["motor_state.reserve"] == [motor.reserve[0] for motor in objects.motor_state[:12]]
 
 
 def assert_equal(one, other):
@@ -124,8 +162,16 @@ def test_temperatures_are_whole_degrees(state):
 
 def sealed(message):
     """A message with the CRC of what it says."""
-    message.crc = go2.crc(go2.packed(message))
+    message["crc"] = go2.crc(go2.packed(message))
     return message
+
+
+def change(message, name, value, place=None):
+    """Change a number of a message, or the one of a motor."""
+    values = message[name]
+    if place is not None:
+        values[place] = value
+    message[name] = value if place is None else values
 
 
 @pytest.mark.parametrize("bit", [0, 300, 811 * 8 - 40])
@@ -138,37 +184,37 @@ def test_a_damaged_bit_is_seen(command, bit):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("changed", "said"),
     [
-        (lambda message: setattr(message, "head", (1, 2)), "0102"),
-        (lambda message: setattr(message, "level_flag", 0xEE), "0xee"),
-        (lambda message: setattr(message.motor_cmd[4], "mode", 0x0A), "FL_thigh_joint 10"),
-        (lambda message: setattr(message.motor_cmd[11], "tau", np.nan), "tau"),
-        (lambda message: setattr(message.motor_cmd[0], "kp", np.inf), "kp"),
+        (("head", [1, 2]), "0102"),
+        (("level_flag", 0xEE), "0xee"),
+        (("motor_cmd.mode", 0x0A, 4), "FL_thigh_joint 10"),
+        (("motor_cmd.tau", np.nan, 11), "tau"),
+        (("motor_cmd.kp", np.inf, 0), "kp"),
     ],
 )
-def test_wrong_commands_are_refused(command, change, said):
+def test_wrong_commands_are_refused(command, changed, said):
     """A command of another kind, or without a number, is refused by name though its CRC is right."""
     message = go2.encode_command(command, 1)
-    change(message)
+    change(message, *changed)
     with pytest.raises(go2.MessageError, match=said) as error:
         go2.decode_command(sealed(message))
     assert not isinstance(error.value, go2.CrcError)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("changed", "said"),
     [
-        (lambda message: setattr(message, "head", (0xFE, 0xEE)), "feee"),
-        (lambda message: setattr(message.motor_state[3], "mode", 0), "FL_hip_joint 0"),
-        (lambda message: setattr(message.motor_state[3], "q", np.nan), "joint_positions"),
-        (lambda message: setattr(message.imu_state, "quaternion", (1.0, 0.0, np.inf, 0.0)), "quaternion"),
+        (("head", [0xFE, 0xEE]), "feee"),
+        (("motor_state.mode", 0, 3), "FL_hip_joint 0"),
+        (("motor_state.q", np.nan, 3), "joint_positions"),
+        (("imu_state.quaternion", [1.0, 0.0, np.inf, 0.0]), "quaternion"),
     ],
 )
-def test_wrong_states_are_refused(state, change, said):
+def test_wrong_states_are_refused(state, changed, said):
     """So is a state."""
     message = go2.encode_state(state)
-    change(message)
+    change(message, *changed)
     with pytest.raises(go2.MessageError, match=said):
         go2.decode_state(sealed(message))
 
@@ -176,9 +222,7 @@ def test_wrong_states_are_refused(state, change, said):
 def test_states_of_unitree_mujoco(state):
     """Its states have neither head nor modes, and are read."""
     message = go2.encode_state(state)
-    message.head = (0, 0)
-    for motor in message.motor_state:
-        motor.mode = 0
+    message["head"], message["motor_state.mode"] = [0, 0], [0] * 12
     assert_equal(state, go2.decode_state(sealed(message)))
 
 
