@@ -21,10 +21,10 @@ from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils import distributed
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import LAW, Options, law_of_motors
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint_of
 
-SAME = ["asset.file", "control.", "init_state.", "motors.drive.", "motors.muscle.", "normalization.", "sim.dt"]
+SAME = ["asset.file", "control.", "init_state.", LAW, "motors.drive.", "motors.muscle.", "normalization.", "sim.dt"]
 SAME += ["terrain.measured_points_"]
 """Beginnings of the paths of settings in which a teacher's run must agree: they say what actions and numbers mean."""
 DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
@@ -268,12 +268,10 @@ class Teacher:
         options = Options(task=task or "", load_run=str(file.parent), checkpoint=checkpoint_number(file))
         options.device = env.device.partition(":")[0]  # each process has but one GPU
         run = task_registry.load_run(options)
-        own, theirs = flat(to_dict(env.cfg)), flat(to_dict(run.env_cfg))
-        same = list(SAME)
-        if "critic" in run.train_cfg.obs_groups.actor:  # which sees random parameters as shares of their ranges
-            same += [f"domain_rand.{name}." for name in env.cfg.random_parameters()]
+        task_registry.check_ranges(run, env.cfg)
+        own, theirs = (flat(to_dict(cfg)) | law_of_motors(cfg) for cfg in (env.cfg, run.env_cfg))
         for path in sorted(own.keys() | theirs.keys()):
-            if path.startswith(tuple(same)) and own.get(path) != theirs.get(path):
+            if path.startswith(tuple(SAME)) and own.get(path) != theirs.get(path):
                 raise UserError(f"the teacher '{name}' has {path}={theirs.get(path)}, its student {own.get(path)}")
         self._env, self.cfg = env, run.env_cfg
         self._size = env.observations.policy_size * run.env_cfg.env.history_length
@@ -342,4 +340,5 @@ def shared_out(cfgs: list[Any], env: Any) -> list[int]:
     kinds = ground.layout.kinds()
     able = {kind: [i for i in everyone if shares[i].get(kind)] or everyone for kind in kinds}
     of_worlds = (able[kinds[column]] for column in ground.columns.tolist())
-    return [teachers[world % len(teachers)] for world, teachers in enumerate(of_worlds)]
+    rows = ground.layout.num_rows  # on the same level are worlds whose numbers differ by so many
+    return [teachers[sum(divmod(world, rows)) % len(teachers)] for world, teachers in enumerate(of_worlds)]

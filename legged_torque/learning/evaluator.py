@@ -124,8 +124,6 @@ class TrainingEvaluator:
                 perturbation = self.name or self._settings["perturbation"]
                 self._evaluation = self._task.make_evaluation(self._num_envs, perturbation)
                 worlds = self._evaluation.task
-                high = int(worlds.max_episode_length)
-                worlds.episode_length_buf = torch.randint_like(worlds.episode_length_buf, high)
             self._acting = acting(self._policy, lambda: worlds)
         return self._evaluation
 

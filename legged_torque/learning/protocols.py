@@ -150,7 +150,7 @@ class Evaluation(Protocol):
     """Worlds of their own in which a policy is measured while it trains.
 
     Attributes:
-        task: The worlds, a :class:`Task` that keeps its worlds.
+        task: The worlds, a :class:`Task` that keeps its worlds, which should not all time out at once.
     """
 
     task: Any

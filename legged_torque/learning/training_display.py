@@ -147,7 +147,8 @@ class TrainingDisplay(Display):
         entries |= {name: form.format(numbers[key]) for key, (name, form) in _SHOWN.items() if key in numbers}
         if self._tracking:
             entries["tracking"] = f"{self._tracking[-1]:.3f} (best {max(self._tracking):.3f})"
-            entries["falls"] = f"{self._measured[f'{_EVALUATION}/falls_per_minute']:.1f} per minute"
+            if (falls := self._measured.get(f"{_EVALUATION}/falls_per_minute")) is not None:
+                entries["falls"] = f"{falls:.1f} per minute"
         elsewhere = {_ELSEWHERE.fullmatch(name): number for name, number in self._measured.items()}
         return entries | {f"in {found[1]}": f"{number:.3f}" for found, number in elsewhere.items() if found}
 

@@ -15,6 +15,7 @@ CPU_PRESET = "laptop"  # chosen where there is no GPU
 DEFAULT_TASK = "a1_torque_multihead"
 MOTOR_FILES = (".yaml", ".yml")
 OF_MOTORS = ("motors", "domain_rand")  # sections that such files may have
+LAW = "motors.chain (control law)"
 PUSH = "push_velocity"
 DELAYS = {"action_delay": "motors.delay.range", "sensing_delay": "sensing.delay.range"}
 """What ``evaluate.py --sweep`` takes besides parameters of ``domain_rand``: pushes, and delays with their settings."""
@@ -38,7 +39,9 @@ class Options:
         "auto",
         aliases=("--sim_device", "--rl_device"),  # of legged_gym, where they may differ
     )
-    num_envs: Worlds | None = _option("number of worlds, with torchrun of each process; default: that of the task")
+    num_envs: Worlds | None = _option(
+        "number of worlds, in each process of several, as of torchrun or the preset laptop; default: that of the task"
+    )
     seed: Number | None = _option("random seed; default: that of the training settings")
     preset: str | None = _option(
         "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long), "
@@ -137,6 +140,12 @@ def choose_motors(env_cfg: Any, name: str) -> bool:
     return "delay" in values.get("motors", {})
 
 
+def law_of_motors(env_cfg: Any) -> dict[str, list[str]]:
+    """Return, under the name :data:`LAW`, the links of the chain of motors that belong to the control law."""
+    motors = env_cfg.motors
+    return {LAW: [name for name in motors.chain if getattr(getattr(motors, name, None), "_of_law", False)]}
+
+
 def simulated_latency(env_cfg: Any, motors: str, latency: float | None) -> float:
     """Choose motors as :func:`choose_motors`, and return by how much commands are late [s]: ``latency`` [ms], if given.
 
@@ -163,10 +172,11 @@ def draw_only(env_cfg: Any, name: str) -> None:
     if name == PUSH:
         rand.push_robots = False  # the sweep pushes
     if name in names and not rand.randomize_parameters:
-        rand.randomize_parameters, rand.keep_fixed = True, [other for other in names if other != name]
+        rand.randomize_parameters, rand.keep_fixed = True, list(names)
         for link in (getattr(env_cfg.motors, key, None) for key in env_cfg.motors.chain):
             if link is not None and hasattr(link, "draws"):
                 link.draws = {}
+    rand.keep_fixed = [other for other in rand.keep_fixed if other != name]
 
 
 def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str, Any]:

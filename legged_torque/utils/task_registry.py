@@ -239,12 +239,13 @@ class TaskRegistry:
         return env, runner
 
     def check_ranges(self, run: LoadedRun, env_cfg: Any) -> None:
-        """Raise a UserError if a run's policy sees random parameters, as shares of their ranges, in other ranges."""
+        """Raise a UserError if a run's policy sees the group "critic", and its numbers mean something else."""
         if "critic" in run.train_cfg.obs_groups.actor:
-            trained = self.get_cfgs(run.task, Options(device="cpu"), run.config)[0].random_parameters()
-            for name, value in env_cfg.random_parameters().items():
-                if value != (known := trained.get(name)):
-                    raise UserError(f"the policy sees domain_rand.{name} as shares of {known}, not of {value}")
+            trained = _meaning_of_critic(self.get_cfgs(run.task, Options(device="cpu"), run.config)[0])
+            for path, value in _meaning_of_critic(env_cfg).items():
+                if value != (known := trained.get(path)):
+                    needed = f"needs the training's {path}, {known}, not {value}"
+                    raise UserError(f"the policy of '{run.checkpoint}' sees the group critic: it {needed}")
 
     def _get(self, name: str) -> tuple[type[VecEnv] | str, Any, Any]:
         """Return class and settings of a task; an unknown name is a UserError."""
@@ -290,6 +291,18 @@ class TaskRegistry:
                 file, line = error.filename or "?", error.lineno
             place = f"line {line} of '{Path(file).name}'"
             raise UserError(f"{source} cannot be imported: {place}: {type(error).__name__}: {error}") from error
+
+
+def _meaning_of_critic(env_cfg: Any) -> dict[str, Any]:
+    """Return what orders the group "critic" and scales its random parameters, which are shares of their ranges."""
+    links = ((name, getattr(env_cfg.motors, name, None)) for name in env_cfg.motors.chain)
+    draws = [(f"{name}.{key}", value) for name, link in links for key, value in getattr(link, "draws", {}).items()]
+    return {
+        **{f"domain_rand.{name}": value for name, value in env_cfg.random_parameters().items()},
+        "domain_rand.keep_fixed": sorted(env_cfg.domain_rand.keep_fixed),
+        "draws of motors.chain": draws,
+        "terrain.measure_heights": env_cfg.terrain.measure_heights,
+    }
 
 
 def print_notes(notes: Iterable[str]) -> None:

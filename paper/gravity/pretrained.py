@@ -16,16 +16,23 @@ from legged_torque.utils.cli import check_output
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import held
+from legged_torque.utils.options import LAW, law_of_motors
 from legged_torque.utils.runs import PRETRAINED, with_present_names
 
 SPACES = {
     "env": (
         "asset.file",
         "init_state.default_joint_angles",
+        LAW,
+        "motors.drive",
+        "motors.muscle",
         "env.history_length",
         "sim.dt",
         "control",
         "normalization",
+        "terrain.measure_heights",
+        "terrain.measured_points_x",
+        "terrain.measured_points_y",
     ),
     "train": (
         "actor.class_name",
@@ -134,7 +141,7 @@ def read_pretrained(file: Path) -> dict[str, Any]:
 
 def spaces(env_cfg: Any, train_cfg: Any) -> dict[str, Any]:
     """Return the settings of :data:`SPACES`, by dotted path."""
-    entries = {"env": flat(to_dict(env_cfg)), "train": flat(to_dict(train_cfg))}
+    entries = {"env": flat(to_dict(env_cfg)) | law_of_motors(env_cfg), "train": flat(to_dict(train_cfg))}
     return {
         name: value
         for part, paths in SPACES.items()

@@ -68,11 +68,11 @@ def test_small_commands_become_zero(make_task):
 
 @pytest.mark.parametrize(("tracking", "shares"), [(0.85, [0.3, 0.4, 0.5]), (0.75, [0.3, 0.3, 0.3])])
 def test_ranges_grow(make_task, monkeypatch, tracking, shares):
-    """Each episode's length tracked above 0.8 widens ranges by 0.1, also in other worlds; evaluations take all."""
+    """Each episode's length tracked above 0.8 widens ranges by 0.1, also in worlds anew; evaluations take all."""
     ranges = {"lin_vel_x": [-1.0, 2.0], "lin_vel_y": [0.5, 0.8], "ang_vel_yaw": [-3.0, -1.0]}
     changes = {f"commands.ranges.{name}": value for name, value in ranges.items()}
     changes |= {"commands.curriculum": True, "commands.curriculum_start": 0.3, "env.episode_length_s": 0.1}
-    task, other = (make_task("a1_torque", 300, **OFTEN, **changes, seed=seed) for seed in (1, 2))
+    task, other, fewer = (make_task("a1_torque", count, **OFTEN, **changes, seed=count) for count in (300, 300, 200))
     monkeypatch.setattr(task, "_reward_tracking_lin_vel", lambda: torch.full((300,), tracking))
     for share in shares:
         task.command_generator.resample(torch.ones(300, dtype=torch.bool))
@@ -83,7 +83,12 @@ def test_ranges_grow(make_task, monkeypatch, tracking, shares):
         assert task.curriculum_values()["command_ranges"].item() == pytest.approx(share)
         for _ in range(5):
             step(task)
+    state = task.state_dict()
     other.load_world_state_dict(task.world_state_dict())
+    fewer.load_state_dict(state)
+    assert torch.equal(fewer.command_generator.span, task.command_generator.span)
+    fewer.load_state_dict({name: state[name] for name in ("total_steps", "num_diverged")})  # of an older checkpoint
+    assert fewer.curriculum_values()["command_ranges"] == task.curriculum_values()["command_ranges"]
     assert other.curriculum_values()["command_ranges"] == task.curriculum_values()["command_ranges"]
     assert not evaluation_cfg(task.cfg, 2).commands.curriculum
 

@@ -142,6 +142,9 @@ def test_nominal_pose_is_held(changed, make_task):
     ending = {"asset.terminate_after_contacts_on": ["RL_foot"]}
     assert "'RL_foot' touches the ground" in standing_note(make_task("a1_torque", 1, **ending))
     assert standing_note(make_task("a1_torque", 1, **{"control.stiffness": 0.0})) == "", "it is not held at all"
+    drawn = {"domain_rand.randomize_parameters": True, "domain_rand.stiffness": {"set": [3.0, 3.0]}}
+    assert standing_note(make_task("a1_torque", 1, **drawn)) == "", "the first world's gains are weak, not the task's"
+    assert standing_note(make_task("a1_variable_stiffness", 1, **{"control.stiffness": 3.0})) == "", "a policy's gains"
 
 
 def test_training_notes_a_robot_that_falls(tmp_path):

@@ -78,6 +78,17 @@ def test_parts(make_task, name, setting, ends, tensor):
         assert part["metrics"]["speed"]["mean"] == pytest.approx(expected, rel=1e-4, nan_ok=True)
 
 
+def test_a_parameter_that_is_kept(make_task):
+    """It is drawn in its range for a sweep, others are kept as before."""
+    cfg = task_registry.get_cfgs("a1_position")[0]
+    cfg.domain_rand.randomize_parameters, cfg.domain_rand.keep_fixed = True, ["gravity", "trunk_mass"]
+    draw_only(cfg, "gravity")
+    assert cfg.domain_rand.keep_fixed == ["trunk_mass"]
+    rand = {f"domain_rand.{key}": getattr(cfg.domain_rand, key) for key in ("randomize_parameters", "keep_fixed")}
+    edges = Sweep(make_task("a1_position", 2, **rand), "gravity").edges
+    assert (edges[0], edges[-1]) == (9.51, 10.11)
+
+
 def test_links_that_do_not_exist(make_task):
     """They are left to the task, which refuses them in a line."""
     cfg = task_registry.get_cfgs("a1_position")[0]

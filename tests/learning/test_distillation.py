@@ -9,6 +9,7 @@ import pytest
 import torch
 from support.reproducible import differences, values
 from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
 from tensordict import TensorDict
 from torch import nn
 
@@ -18,8 +19,9 @@ from legged_torque.learning import checkpoint
 from legged_torque.learning.distillation import Distillation, Teachers, shared_out
 from legged_torque.learning.memory import acting
 from legged_torque.learning.protocols import Transition
-from legged_torque.utils.config import section_keys, to_dict
+from legged_torque.utils.config import section_keys, set_by_path, to_dict
 from legged_torque.utils.options import Options
+from legged_torque.utils.task_registry import LoadedRun
 
 WORLDS, STEPS, OBS, ACTIONS = 3, 8, 5, 2
 SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_steps_per_env=4"]
@@ -203,6 +205,10 @@ def test_teachers_teach_where_they_have_trained(make_task):
     for member, settings in zip(members, cfgs, strict=True):
         member.cfg = settings
     assert Teachers(members, task)(None)[:, 0].tolist() == [0] * 4 + [1] * 4 + [0, 1] * 4
+    levels = {"terrain.num_rows": 2, "terrain.curriculum": False}
+    task = make_task("a1_rough_torque", 16, **MAP | levels, **shares)
+    taught = zip(task.terrain.levels.tolist()[8:], shared_out(cfgs, task)[8:], strict=True)
+    assert sorted(taught) == [(level, teacher) for level in (0, 1) for teacher in (0, 0, 1, 1)]
 
 
 @pytest.fixture(scope="module")
@@ -266,9 +272,38 @@ def test_a_teacher_that_sees_random_parameters(teacher):
     (seer,) = (root / "logs" / "a1_position").glob("*critic")
     student = ["train.py", *SMALL, *OF_STUDENT, f"--set=distillation.teachers=[{seer.name}]", "--max_iterations=1"]
     measure = ["evaluate.py", "--device=cpu", "--num_envs=4", "--steps=4", f"--load_run={seer}"]
-    for script, told in ((student, "has domain_rand."), (measure, "the policy sees domain_rand.")):
+    for script in (student, measure):
         assert run_here(*script, root=root)[0] == 0
-        assert_told_in_one_line(run_here(*script, "--ranges=hard", root=root), told)
+        assert_told_in_one_line(run_here(*script, "--ranges=hard", root=root), "needs the training's domain_rand.")
+
+
+KEPT = {"domain_rand.keep_fixed": ["gravity", "trunk_mass"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "change", "told"),
+    [
+        ("a1_rough_torque", {}, {"terrain.measure_heights": True}, "terrain.measure_heights, False, not True"),
+        ("a1_torque", KEPT, {"domain_rand.keep_fixed": ["gravity"]}, "keep_fixed, ['gravity', 'trunk_mass'], not ['"),
+        ("a1_torque", {}, {"motors.ideal.draws": {"x": {"set": [0, 1]}}}, "draws of motors.chain, [], not [('ideal.x'"),
+        ("a1_torque", KEPT, {"domain_rand.keep_fixed": ["trunk_mass", "gravity"], "noise.add_noise": True}, ""),
+    ],
+)
+def test_what_a_policy_that_sees_all_needs(name, before, change, told):
+    """Order and scales of what it sees must be those of its training, all else may change."""
+    trained, now = (task_registry.get_cfgs(name)[0] for _ in range(2))
+    train_cfg = task_registry.get_cfgs(name)[1]
+    for cfg, changes in ((trained, before), (now, before | change)):
+        for path, value in changes.items():
+            set_by_path(cfg, path, value)
+    config = {"task": name, "env": to_dict(trained), "train": {}}
+    run = LoadedRun(Path("run"), config, trained, train_cfg, Path("model_1.pt"))
+    task_registry.check_ranges(run, now)
+    train_cfg.obs_groups.actor = ["critic"]
+    if told:
+        assert told in error_of(task_registry.check_ranges, run, now)
+    else:
+        task_registry.check_ranges(run, now)
 
 
 def test_refusals(teacher):
@@ -279,6 +314,7 @@ def test_refusals(teacher):
         "--set=distillation.teachers=[nobody]": "unknown run 'nobody'",
         "--set=distillation.teachers=[other.pt]": "'other.pt' is no whole checkpoint",
         "--set=control.action_scale=0.5": "has control.action_scale=",
+        "--set=motors.chain=[delay, drive, ideal]": "has motors.chain (control law)=[], its student ['drive']",
         "--set=distillation.gradient_length=3": "gradient_length must divide runner.num_steps_per_env, 4, not be 3",
         "--set=distillation.num_mini_batches=5": "num_mini_batches is 5, more than the 4 worlds",
         "--set=algorithm.learning_rate=1e-4": "is not read by legged_torque.learning.distillation:Distillation",

@@ -116,17 +116,20 @@ def test_a_table_of_another_version(tmp_path):
 
 
 def test_falls_do_not_synchronize_worlds(make_task):
-    """Worlds with trunks in the ground, whose episodes end at once, time out like those with robots in the air."""
-    evaluation = make_task("a1_torque", 1, **{"env.episode_length_s": 0.1}).make_evaluation(5, "none")
-    task = evaluation.task  # an episode has five steps
-    task.episode_length_buf = torch.arange(5)
+    """Trunks in the ground end episodes at once, and time-outs are staggered as in the air; ages are those observed."""
+    length = {"env.episode_length_s": 0.025}  # five steps
+    evaluation = make_task("a1_multihead_two_rates", 1, **length).make_evaluation(5, "none")
+    task, ages = evaluation.task, torch.zeros(5)
+    task.steps_before.copy_(torch.arange(5))
+    phase = task.observations.policy_columns("position_phase")[0]
     for step in range(1, 12):
         task.sim.qpos[:] = torch.tensor([0, 0, 0.03, 1.0, 0, 0, 0, *[0.0, 0.8, -2.6] * 4])
         task.sim.qpos[3:, 2] = 2.0
-        evaluation.step(torch.zeros(5, 12))
+        seen = evaluation.step(torch.zeros(5, 24))["policy"][:, phase]
         assert task.state.reset_buf[:3].all() and (task.base_pos[:, 2] > 0.2).all()
         assert task.state.reset_buf[3:].tolist() == [(world + step) % 5 == 0 for world in (3, 4)]
-        assert task.episode_length_buf.tolist() == [(world + step) % 5 for world in range(5)]
+        ages = (ages + 1) * ~task.state.reset_buf
+        assert task.episode_length_buf.tolist() == ages.tolist() and torch.equal(seen, ages % 4 / 4)
 
 
 def test_training_does_not_notice(make_runner):
@@ -171,7 +174,7 @@ def test_random_numbers_of_its_own(make_runner, noted):
     seen = [torch.stack([torch.cat([note.commands, note.obs["policy"]], dim=1) for note in each]) for each in notes]
     assert torch.equal(seen[0], seen[1]) and not torch.equal(seen[0], seen[2])
     assert len(seen[0][:, :, :3].flatten().unique()) == 4 * 4 * 3  # commands are drawn anew in every step
-    assert len(set(notes[0][0].task.episode_length_buf.tolist())) > 1
+    assert len(set(notes[0][0].task.steps_before.tolist())) > 1
 
 
 @pytest.mark.parametrize(("chosen", "expected"), [("", "low"), ("doubled", "doubled")])

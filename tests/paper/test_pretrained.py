@@ -120,6 +120,10 @@ def test_what_does_not_fit_is_refused(made):
     before = contents(root)
     for setting, message in {
         "control.torque_scale=5": "its control.torque_scale is 8.0, here it is 5.0",
+        "motors.chain=[delay,drive,ideal]": "its motors.chain (control law) is [], here it is ['drive']",
+        "motors.drive.damping=1": "its motors.drive.damping is 0.0, here it is 1.0",
+        "terrain.measure_heights=true": "its terrain.measure_heights is False, here it is True",
+        "terrain.measured_points_y=[0.0, 0.1]": "its terrain.measured_points_y is [-0.5, ",
         "actor.hidden_dims=[64]": "its actor.hidden_dims is [512, 256, 128], here it is [64]",
         "obs_groups.actor=[critic]": "its obs_groups.actor is ['policy'], here it is ['critic']",
         "pretraining.max_residual=2.5": "was made with pretraining.max_residual 3.0, here it is 2.5: remove the file",

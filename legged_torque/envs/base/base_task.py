@@ -12,6 +12,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.evaluation import WalkingEvaluation
 from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.step_meter import StepMeter
@@ -46,6 +47,7 @@ class BaseTask(VecEnv):
 
     sim: Engine
     terrain: Terrain
+    command_generator: UniformCommands
     state: RobotState
     meter: StepMeter
     obs_buf: TensorDict
@@ -151,13 +153,17 @@ class BaseTask(VecEnv):
     # ---- checkpoints -------------------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a checkpoint must keep of the task: its counters, on which all curricula depend."""
-        return {"total_steps": self.total_steps.clone(), "num_diverged": self.num_diverged.clone()}
+        """Return what a checkpoint must keep of the task: what its curricula depend on, and counters."""
+        ranges = self.command_generator.curriculum
+        share = {"command_ranges": ranges.share.clone()} if ranges else {}
+        return {"total_steps": self.total_steps.clone(), "num_diverged": self.num_diverged.clone(), **share}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from the counters of a checkpoint."""
+        """Continue from those of a checkpoint."""
         self.total_steps.copy_(state["total_steps"])
         self.num_diverged.copy_(state["num_diverged"])
+        if (ranges := self.command_generator.curriculum) and "command_ranges" in state:
+            ranges.go_on(state["command_ranges"])
         self.update_curriculum()
 
     def keep(self, name: str, tensor: Tensor) -> Tensor:

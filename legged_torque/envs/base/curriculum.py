@@ -63,6 +63,12 @@ class RangeCurriculum:
         """Return the share, and what decides on its growth."""
         return {"share": self.share, "sums": self._sums}
 
+    def go_on(self, share: Tensor) -> None:
+        """Continue from a share of the full ranges."""
+        self.share.copy_(share)
+        self._sums.zero_()
+        self._set_ranges()
+
     def _set_ranges(self) -> None:
         """Write the ranges."""
         self._low.copy_(torch.lerp(self._middle, self._full_low, self.share))

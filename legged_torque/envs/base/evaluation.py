@@ -3,6 +3,7 @@
 import copy
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -24,13 +25,15 @@ class WalkingEvaluation:
         self.task = type(source)(evaluation_cfg(source.cfg, num_envs, perturbation), source.device)
         self.task.step_graph.enabled = source.step_graph.enabled
         self._metrics = WalkingMetrics(self.task)
+        before = self._steps_before = self.task.keep("steps_before", self.task.steps_before)
+        before.copy_(torch.randint_like(before, self.task.max_episode_length))
 
     def step(self, actions: Tensor) -> TensorDict:
-        """Make a control step, measure it, and return the observations; after a fall, an episode's age goes on."""
-        task, commands = self.task, self.task.state.commands.clone()
-        age = (task.episode_length_buf + 1) % task.max_episode_length
+        """Make a control step, measure it, and return the observations; a fall does not put off a time-out."""
+        task, commands, before = self.task, self.task.state.commands.clone(), self._steps_before
+        clock = (before + task.episode_length_buf + 1) % task.max_episode_length
         obs = task.step(actions)[0]
-        task.episode_length_buf = age  # or worlds whose robots fall together would time out together
+        before.copy_(clock - task.episode_length_buf)  # or worlds whose robots fall together would time out together
         self._metrics.add_step(commands)
         return obs
 

@@ -5,9 +5,11 @@ import numpy as np
 
 from legged_torque.envs.base.asset import Asset, load_asset
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.config import by_joint
 from legged_torque.sim.model import FLOOR
 from legged_torque.utils.standing import hold_pose
 
+GAINS = ("stiffness", "damping")
 STANDING_TIME = 3.0  # for which the nominal pose is held [s]
 _FAR = 10.0  # farther than any part is from the floor [m]
 
@@ -15,13 +17,13 @@ _FAR = 10.0  # farther than any part is from the floor [m]
 def standing_note(task: LeggedRobot) -> str:
     """Describe how a robot held in its nominal pose by PD control falls on a plane; empty if it stands.
 
-    One robot is simulated for :data:`STANDING_TIME`, with the task's gains and limits. Tasks without gains are skipped.
-    A UserError if the simulation diverges.
+    One robot is simulated for :data:`STANDING_TIME`, with the gains of the settings and the task's limits. Tasks
+    without gains, or whose policies change them, are skipped. A UserError if the simulation diverges.
     """
     asset, control = load_asset(task.cfg), task.cfg.control
-    numbers = (task.default_dof_pos, task.p_gains[0], task.d_gains[0], task.torque_limits)
-    pose, stiffness, damping, limits = (tensor.double().cpu().numpy() for tensor in numbers)
-    if not stiffness.any():
+    pose, limits = (tensor.double().cpu().numpy() for tensor in (task.default_dof_pos, task.torque_limits))
+    stiffness, damping = (np.array(by_joint(name, getattr(control, name), task.dof_names)) for name in GAINS)
+    if not stiffness.any() or any(term.whole_law for term in task.control_law.terms):
         return ""
     every = 1 if control.refresh_torques else control.decimation
     ending = [asset.mj_model.geom(asset.geom_names[place]).id for place in asset.terminating]

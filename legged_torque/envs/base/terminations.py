@@ -20,11 +20,13 @@ class Terminations:
 
     cfg: LeggedRobotCfg
     state: RobotState
+    num_envs: int
     max_episode_length: int
 
     def _init_terminations(self, contacts: list[int], device: str) -> None:
         """Collect the terms in use; ``contacts`` are geoms that may not touch. A UserError if a term is unknown."""
         self.termination_contact_indices = torch.tensor(contacts, dtype=torch.long, device=device)
+        self.steps_before = torch.zeros(self.num_envs, dtype=torch.long, device=device)  # in evaluations
         known = [name.removeprefix("_termination_") for name in dir(self) if name.startswith("_termination_")]
         self.terminations: dict[str, Callable[[], Tensor]] = {}
         for name, limit in to_dict(self.cfg.terminations).items():
@@ -41,7 +43,7 @@ class Terminations:
                 given = f"{over.dtype} {tuple(over.shape)}"
                 raise UserError(f"termination '{name}' must be one bool for each world, not {given}")
             ended = ended | over
-        time_out = state.episode_length >= self.max_episode_length
+        time_out = state.episode_length + self.steps_before >= self.max_episode_length
         state.reset_buf.copy_(ended | time_out)
         state.time_out_buf.copy_(time_out & ~ended)
 
