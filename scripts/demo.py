@@ -7,6 +7,7 @@ Examples:
 It is play.py --policy ... --viewer web, on kinds of rough ground that the policies for it cross.
 """
 
+import argparse
 import runpy
 import sys
 from typing import Annotated
@@ -26,11 +27,12 @@ def main() -> None:
     parser.add_argument("policy", nargs="?", default=POLICY, help="robot/approach; default: %(default)s")
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s")
     parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
+    parser.add_argument("--device", default="auto", help=argparse.SUPPRESS)  # of the page before, if it has chosen this
     args = parser.parse_args()
     cli.check_args(args, port=Annotated[int, Limits(1, 65535)])
     ground = ROUGH if "rough" in args.policy else []
     words = [f"--policy={args.policy}", "--viewer=web", "--num_envs=1", f"--host={args.host}", f"--port={args.port}"]
-    sys.argv[1:] = [*words, *ground, "--command", "0.5", "0", "0"]
+    sys.argv[1:] = [*words, *cli.option_words(args, "device"), *ground, "--command", "0.5", "0", "0"]
     runpy.run_path(str(SCRIPTS_DIR / "play.py"), run_name="__main__")
 
 

@@ -11,9 +11,11 @@ Keys: s stand up, p policy, d or space damping, x no torque, arrows, comma and p
 
 import argparse
 import contextlib
+import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
@@ -97,7 +99,7 @@ def main() -> None:
         while not ended.wait(POLL):
             if log:
                 log.write()
-            view.show()
+            say(view.show)
 
     with StopRequest(lambda text: None) as stop, contextlib.ExitStack() as parts:
         for part in (view.live, *operators, aside, contextlib.closing(session), loop):  # left in the reverse order
@@ -111,11 +113,20 @@ def main() -> None:
                 break
             time.sleep(POLL)
     telling.result()
-    print("\n".join([view.line(), *(f"stopped: {reason}" for reason in session.stops)]))
+    said = "\n".join([view.line(), *(f"stopped: {reason}" for reason in session.stops)])
+    say(lambda: print(said, flush=True))
     if loop.error is not None:
         raise loop.error
     if session.stops:
         sys.exit(1)
+
+
+def say(write: Callable[[], None]) -> None:
+    """Write to standard output; once that fails, as behind ``| head``, all goes nowhere: the robot must walk on."""
+    try:
+        write()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:

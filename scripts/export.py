@@ -9,10 +9,11 @@ Examples:
 import shlex
 from pathlib import Path
 
-from legged_torque.deploy.description import DESCRIPTION_FILE
+from legged_torque.deploy.description import DESCRIPTION_FILE, place_of_results
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.files import path_inside
+from legged_torque.utils.task_registry import LOGS
 
 
 def main() -> None:
@@ -33,7 +34,8 @@ def main() -> None:
         from legged_torque.runtime.formats import WRITERS
     env, runner = task_registry.make_loaded(run, options, nominal_cfg(run.env_cfg))
     iterations = runner.current_learning_iteration
-    out = args.out or path_inside(run.folder, f"exported_{iterations}")
+    place = place_of_results(run.folder, options.policy, options.log_root or LOGS)
+    out = args.out or path_inside(place, f"exported_{iterations}")
     training = {"run": run.folder.name, "checkpoint": run.checkpoint.name}
     training |= {"iterations": iterations, "total_steps": runner.logger.tot_timesteps}
     difference, unsupported = export_policy(env, runner.alg.policy(), out, run.task, training, WRITERS.get(args.format))

@@ -14,6 +14,7 @@ from typing import Any
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json, write_whole
 from legged_torque.utils.plain_yaml import Dumper
 
@@ -28,6 +29,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--json", type=Path, help="JSON file of all numbers, intervals and errors to write")
     cli.add_options(parser, "device", "task_file")
     args = parser.parse_args()
+    if not args.log.is_file():
+        raise UserError(f"cannot read '{args.log}': there is no such file")
     args.out = args.out or args.log.with_suffix(".yaml")
     for file in filter(None, (args.out, args.json)):
         cli.check_output(file)

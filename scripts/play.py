@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from legged_torque import SCRIPTS_DIR
+from legged_torque.deploy.description import place_of_results
 from legged_torque.envs import task_registry
 from legged_torque.terrain.selection import named_kinds, rising_levels, select_tiles
 from legged_torque.utils import cli
@@ -31,7 +32,7 @@ from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.options import DEFAULT_TASK
-from legged_torque.utils.task_registry import LoadedRun, experiment_dir, set_seed
+from legged_torque.utils.task_registry import LOGS, LoadedRun, experiment_dir, set_seed
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -71,7 +72,8 @@ def main() -> None:
 
         env, runner = task_registry.make_loaded(run, options)
         title = f"{run.checkpoint}, after {int(runner.logger.tot_timesteps):,} steps of training"
-        video = path_inside(run.checkpoint.parent, f"videos/{run.checkpoint.stem}.mp4")
+        place = place_of_results(run.checkpoint.parent, options.policy, options.log_root or LOGS)
+        video = path_inside(place, f"videos/{run.checkpoint.stem}.mp4")
         if roll_out(args, env, runner.get_inference_policy(env.device), title, video):
             show_in_tensorboard(video, run.iterations)
     else:
@@ -151,10 +153,10 @@ def show(args: argparse.Namespace, run: LoadedRun) -> None:
         session.companion = Session(task_registry.get_task_class(compared.task), compared, device)
     if args.command:
         session.set_command(tuple(args.command))
-    watch(session)
+    port = watch(session)
     if session.chosen:
-        demo = [str(SCRIPTS_DIR / "demo.py"), session.chosen, f"--host={args.host}", f"--port={args.port}"]
-        os.execv(sys.executable, [sys.executable, *demo])
+        demo = [str(SCRIPTS_DIR / "demo.py"), session.chosen, f"--host={args.host}", f"--port={port}"]
+        os.execv(sys.executable, [sys.executable, *demo, *cli.option_words(args, "device")])
 
 
 def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
@@ -182,8 +184,8 @@ def agent(name: str, env: LeggedRobot) -> Callable[[TensorDict], Tensor]:
     return lambda obs: actions.uniform_(-1.0, 1.0) if name == "random" else actions
 
 
-def import_viewer(args: argparse.Namespace, title: str) -> Callable[[Session], None]:
-    """Return the function that shows a session; a UserError if a package or a screen is missing."""
+def import_viewer(args: argparse.Namespace, title: str) -> Callable[[Session], int | None]:
+    """Return what shows a session and returns a page's port; a UserError if a package or a screen is missing."""
     if args.viewer == "native":
         from legged_torque.viewer import native
 

@@ -9,6 +9,8 @@ Examples:
 """
 
 import argparse
+import re
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -20,13 +22,14 @@ from legged_torque.deploy.description import DESCRIPTION_FILE, NETWORK_FILE, rea
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, printable
-from legged_torque.utils.files import part_of, write_errors, write_whole
+from legged_torque.utils.files import part_of, portable_path, without_machine, write_errors, write_whole
 from legged_torque.utils.plain_yaml import Dumper
 from legged_torque.utils.policies import CARD, read_card, sha256, upload
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
 ROBOTS, STEPS, SHOWN_STEPS = 16, 500, 250
 VIDEO = "replay.mp4"  # the name that Hugging Face shows
+ABSOLUTE = re.compile(r"(?<![^\s=\[{,:'\"])/[^\]},'\"]+")  # a path in a word of a command, also one of a list
 README = """\
 ---
 library_name: legged_torque
@@ -76,7 +79,10 @@ def main() -> None:
         from legged_torque.viewer.video import SimulationRecorder
     _, network = read(args.policy)
     policy = Policy(network)
-    robot = MujocoRobot(resource_path(policy.description["robot"]["file"]), policy.description)
+    xml = policy.description["robot"]["file"]
+    if Path(xml).is_absolute():
+        raise UserError(f"'{xml}' is a path of this machine: export anew with --set asset.file=RELATIVE_PATH")
+    robot = MujocoRobot(resource_path(xml), policy.description)
     simulation = Simulation(policy, robot)
     recorder, part = SimulationRecorder(simulation), part_of(args.out)
 
@@ -120,10 +126,19 @@ def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dic
     if (run / CONFIG_FILE).is_file() and (run / training["checkpoint"]).is_file():
         from legged_torque.learning import checkpoint
 
-        shutil.copy(run / CONFIG_FILE, folder)
+        settings = portable_settings(load_config(run))
+        text = yaml.dump(settings, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
+        write_whole(folder / CONFIG_FILE, text)
         checkpoint.write_actor(run / training["checkpoint"], folder)
-        card["trained"] = load_config(run).get("command", "")
+        card["trained"] = settings["command"]
     return card
+
+
+def portable_settings(config: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a run's config.yaml without the folders of this machine, also in its command."""
+    words = shlex.split(config.get("command", ""))
+    command = shlex.join(ABSOLUTE.sub(lambda found: portable_path(found[0]), word) for word in words)
+    return without_machine(config) | {"command": command}
 
 
 def write_cards(folder: Path, card: dict[str, Any]) -> None:

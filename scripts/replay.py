@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Limits, Positive
 from legged_torque.utils.options import simulated_latency
 
@@ -28,6 +29,10 @@ def parse_args() -> argparse.Namespace:
     cli.add_options(parser, "task_file")
     args = parser.parse_args()
     cli.check_args(args, latency=Annotated[float, Limits(0, 1000)], limit=Positive)
+    if args.plot:
+        cli.check_output(args.plot)
+        if args.plot.suffix not in (".png", ".svg", ".pdf"):
+            raise UserError(f"cannot write '{args.plot}': a figure needs a name that ends in .png, .svg or .pdf")
     return args
 
 
@@ -41,6 +46,11 @@ def main() -> None:
         from legged_torque.runtime.log import RecordedLog
         from legged_torque.runtime.replay import same_actions, simulate
         from legged_torque.runtime.sim_robot import SimRobot
+
+        if args.plot:
+            from legged_torque.paper.plotting import load_pyplot
+
+            load_pyplot()  # a UserError if it is missing
     log, policy = RecordedLog(args.log), Policy(args.policy)
     steps, equal = same_actions(log, policy)
     print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")

@@ -21,6 +21,7 @@ from legged_torque.utils.errors import UserError, counted, printable
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
 from legged_torque.utils.options import choose_motors
+from legged_torque.utils.runs import CONFIG_FILE
 from legged_torque.utils.task_registry import LOGS
 
 
@@ -125,7 +126,8 @@ def last_export(log_root: Path) -> Path:
     exports = list(log_root.glob(f"*/*/exported_*/{DESCRIPTION_FILE}"))
     if not exports:
         raise UserError(f"there is no exported policy in '{log_root}'; run export.py first, or name a policy")
-    return max(exports, key=lambda file: (file.parents[1].name, file.stat().st_mtime)).parent
+    of_run = {file: (file.parents[1] / CONFIG_FILE).is_file() for file in exports}  # not of a policy from elsewhere
+    return max(exports, key=lambda file: (of_run[file], file.parents[1].name, file.stat().st_mtime)).parent
 
 
 if __name__ == "__main__":

@@ -134,7 +134,7 @@ def learns_in_parts(train_cfg: Any) -> bool:
 
 
 def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
-    """Return settings as options change them, with the task of the first teacher's run, and teachers by their files."""
+    """Return the first teacher's settings of the task, as options change them, with teachers by their files."""
     root, names = experiment_dir(train_cfg, options.log_root), train_cfg.distillation.teachers
     files = [find_checkpoint_of(root, name).resolve() for name in names]
     config = load_config(files[0].parent) | {"train": {}}

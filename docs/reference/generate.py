@@ -164,6 +164,7 @@ UNLISTED = {
     "dof_pos_limits": "Joint limits, narrowed by `rewards.soft_dof_pos_limit` [rad]. Shape: (num_dof, 2).",
     "penalized_contact_indices": "Places of the geoms of `asset.penalize_contacts_on` in contacts. Shape: (geoms,).",
     "termination_contact_indices": "Those of `asset.terminate_after_contacts_on`. Shape: (geoms,).",
+    "steps_before": "In evaluations, steps besides the episode's that count for time-outs. Shape: (num_envs,), int64.",
     "held_joints": "1 for each joint of `rewards.held_joints`, else 0. Shape: (num_dof,).",
 }
 """Attributes of tasks that no docstring lists."""

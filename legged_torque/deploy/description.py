@@ -57,6 +57,11 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     return description, network
 
 
+def place_of_results(run: Path, policy: str | None, log_root: str | Path) -> Path:
+    """Return the folder for what is made of a run: its own, but for policies of the package and the Hub a new one."""
+    return Path(log_root, policy.removeprefix(HUB)) if policy and not policy.startswith(WANDB) else run
+
+
 def to_yaml(description: dict[str, Any]) -> str:
     """Return the text of a description, section by section with the schema's comment above each."""
     parts = []
@@ -157,6 +162,15 @@ def require(*packages: str, extra: str = "export") -> None:
     for package in packages:
         if importlib.util.find_spec(package) is None:
             raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")
+
+
+def holds_gains(description: dict[str, Any]) -> bool:
+    """Return whether torques of gains are held for a control step, while drives of robots make them anew all the time.
+
+    That is ``control.refresh_torques: false`` with the term position_residual.
+    """
+    timing, terms = description["timing"], [term["name"] for term in description["actions"]["terms"]]
+    return "position_residual" in terms and timing["decimation"] > 1 and not timing["refresh_torques"]
 
 
 def not_understood(description: dict[str, Any], observations: Container[str], actions: Container[str]) -> list[str]:

@@ -74,7 +74,7 @@ def export_policy(
     folder: Path,
     name: str,
     training: dict[str, Any],
-    add: Callable[[Path, torch.nn.Module], None] | None = None,
+    add: Callable[[Path], None] | None = None,
 ) -> tuple[float, list[str]]:
     """Write a policy with everything that is needed to run it, and check the files.
 
@@ -88,7 +88,7 @@ def export_policy(
         folder: Where to write; files of an earlier export there are replaced or removed, ``policy.yaml`` last.
         name: Name of the task.
         training: "run", "checkpoint", "iterations" and "total_steps" of the policy.
-        add: Adds files of another format to an export, for its folder and network.
+        add: Adds files of another format to an export, for its folder.
 
     Returns:
         Largest difference between the exported networks and the model, and what is unsupported.
@@ -108,7 +108,7 @@ def export_policy(
         description["unsupported"] = unknown_parts(task, description) or differences(task, model, Policy(part))
         write_description(part, description)
         if add:
-            add(part, model.as_onnx(verbose=False).cpu().eval())
+            add(part)
         unitree = [folder / "params/deploy.yaml", folder / "exported/policy.onnx"]
         others = (*folder.glob("leapp/*.*"), *(unitree if unitree[0].is_file() else ()))
         for file in others if (folder / DESCRIPTION_FILE).is_file() else ():  # an earlier policy in other formats

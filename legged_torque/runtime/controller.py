@@ -5,6 +5,7 @@ from enum import Enum
 
 import numpy as np
 
+from legged_torque.deploy.description import holds_gains
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake
 from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
@@ -84,6 +85,8 @@ class Controller:
         terms = [term["name"] for term in policy.description["actions"]["terms"]]
         if not {*terms} <= {"position_residual", "torque"}:
             raise UserError(f"a robot's drives know position_residual and torque, not the terms {', '.join(terms)}")
+        if holds_gains(policy.description):
+            raise UserError("drives do not hold torques of position_residual: train with control.refresh_torques true")
 
     # ---- the operator ------------------------------------------------------------------------------------------------
 
@@ -168,7 +171,7 @@ class Controller:
     def _fault(self) -> str:
         """Return why the robot must not move."""
         if self.state is None:
-            return "the robot has not said anything yet"
+            return next(iter(self._problems), "the robot has not said anything yet")
         if problem := self._lateness(self._now, self._missed):
             return problem
         seen = Received(None, self._damaged, problems=self._problems)

@@ -20,7 +20,7 @@ try:
 
     from legged_torque.runtime import unitree_go2
     from legged_torque.runtime.motion_switcher import SERVICE, Release, Request_, Response_, SportMode
-    from legged_torque.runtime.unitree_go2 import LowCmd_, LowState_
+    from legged_torque.runtime.unitree_go2 import LowCmd_, LowState_, Message
 except ImportError as error:
     raise UserError(f"DDS needs the extra: pip install 'legged_torque[robot]' ({error})") from None
 
@@ -103,9 +103,9 @@ class _Side:
                     received.newest = contents
         return received
 
-    def _is_newest(self, message: LowCmd_ | LowState_, received: Received) -> bool:
+    def _is_newest(self, message: Message, received: Received) -> bool:
         """Return whether a message is newer than all of its sender before it; counts what is lost and late."""
-        sender, number = message.sample_info.publication_handle, getattr(message, self.number)
+        sender, number = message.sample_info.publication_handle, message[self.number]
         if sender not in self._senders[-1:]:
             if sender in self._senders:
                 received.problems.append(f"two programs send {TOPICS[self.reads[0]]}")
@@ -126,7 +126,7 @@ class _Side:
         self._reader = self._writer = self._service_reader = self._service_writer = None
         self._participant = self._domain = None
 
-    def publish(self, message: LowCmd_ | LowState_) -> None:
+    def publish(self, message: Message) -> None:
         """Send a message as it is."""
         self._writer.write(message)
 
@@ -135,7 +135,8 @@ class Go2Robot(_Side):
     """A robot, real or simulated, as the program sees it: a :class:`~legged_torque.runtime.interface.Transport`.
 
     States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message. While the robot's sport
-    mode is not released, that is a problem, and no command is sent. A robot that starts anew is asked anew.
+    mode is not released, that is a problem, and no command is sent. A robot that starts anew is asked anew; meanwhile
+    only damping is sent, as the new sender may be another program next to a robot that walks.
     """
 
     writes, reads = (LowCmd_, Request_), (LowState_, Response_)
@@ -148,8 +149,8 @@ class Go2Robot(_Side):
 
     def receive(self) -> Received:
         """Return what has come, and ask for what is missing."""
-        sender, received = self._senders[-1:], super().receive()
-        if self._senders[-1:] != sender:
+        known, received = len(self._senders), super().receive()
+        if len(self._senders) > known:
             self._release.begin()
         if self._release.problem:
             self._release.look(_taken(self._service_reader), time.monotonic())
@@ -158,7 +159,8 @@ class Go2Robot(_Side):
 
     def send(self, command: MotorCommand) -> None:
         """Tell the drives, once they are free; raises MessageError if a number is not finite."""
-        if not self._release.problem:
+        is_damping = not (command.kp.any() or command.tau.any())
+        if not self._release.problem or (self._sent and is_damping):
             self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
             self.publish(unitree_go2.encode_command(command, self._sent))
 
@@ -187,5 +189,5 @@ class Go2Side(_Side):
     def send(self, state: RobotState, is_damaged: bool = False) -> None:
         """Tell the program, with a wrong checksum if asked to; raises MessageError if a number is not finite."""
         message = unitree_go2.encode_state(state)
-        message.crc ^= is_damaged
+        message["crc"] ^= is_damaged
         self.publish(message)

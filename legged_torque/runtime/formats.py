@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legged_torque.deploy.description import NETWORK_FILE, not_understood, read, require
+from legged_torque.deploy.description import NETWORK_FILE, holds_gains, not_understood, read, require
 from legged_torque.runtime.interface import JOINT_ORDER
 from legged_torque.utils.errors import refuse
 from legged_torque.utils.plain_yaml import Dumper
@@ -23,14 +23,15 @@ def _read(folder: Path, known_actions: set[str]) -> tuple[dict[str, Any], list[s
     problems = [*description.get("unsupported", []), *not_understood(description, UNITREE, known_actions)]
     motors = description.get("motors", {}).items()
     problems += [f"the gains of the motors' {name}" for name, motor in motors if motor.get("model") == "drive"]
+    problems += ["control.refresh_torques: false"] if holds_gains(description) else []
     return description, problems
 
 
-def write_deploy_yaml(folder: Path, network: Any) -> None:
+def write_deploy_yaml(folder: Path) -> None:
     """Add ``params/deploy.yaml`` and ``exported/policy.onnx`` to an export, for Unitree's C++ (unitree_rl_lab).
 
     That clips observations before it scales them, commands to their ranges alone, and runs networks of one robot. A
-    UserError lists what it lacks. ``network`` is not needed.
+    UserError lists what it lacks.
     """
     import onnx
 
@@ -71,11 +72,10 @@ def write_deploy_yaml(folder: Path, network: Any) -> None:
     (folder / "params" / "deploy.yaml").write_text(text, encoding="utf-8")
 
 
-def write_leapp(folder: Path, network: Any) -> None:
+def write_leapp(folder: Path) -> None:
     """Add ``leapp/`` to an export: a graph from measurements to targets of joints, which NVIDIA's ``leapp`` reads.
 
-    Orientations are (x, y, z, w), as in Isaac Lab. ``network`` returns actions for observations, in torch. A UserError
-    lists what the format lacks.
+    Orientations are (x, y, z, w), as in Isaac Lab. A UserError lists what the format lacks.
     """
     require("leapp", extra="leapp")
     import torch
@@ -98,6 +98,7 @@ def write_leapp(folder: Path, network: Any) -> None:
     logging.disable()  # it would name a temporary folder
     start("leapp", save_path=str(folder))
     inputs = annotate.input_tensors("policy", [TensorSemantics(*each) for each in given.values()])
+    network = torch.jit.load(str(folder / description["network"]["torchscript"]))
     before = {"last_action": torch.zeros(1, description["network"]["num_actions"])}
     values = dict(zip(given, inputs, strict=True)) | {"last_action": annotate.state_tensors("policy", before)}
     x, y, z, w = (values["quaternion"][:, i : i + 1] for i in range(4))

@@ -20,6 +20,7 @@ from legged_torque.utils.errors import UserError
 
 NAMES = ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")
 KEY_MODES = {"s": Mode.STAND, "p": Mode.POLICY, "d": Mode.DAMPING, " ": Mode.DAMPING, "x": Mode.PASSIVE}
+KEY_MODES |= {"\x1a": Mode.DAMPING, "\x1c": Mode.DAMPING}  # Ctrl-Z, Ctrl-\
 KEYS = {"\x1b[A": (0, 0.1), "\x1b[B": (0, -0.1), ",": (1, 0.1), ".": (1, -0.1), "\x1b[D": (2, 0.1), "\x1b[C": (2, -0.1)}
 """Index in the command and its change [m/s or rad/s], by keys: up, down, comma, period, left and right."""
 NUMBERS = ("forward", "sideways", "turn")  # of a datagram: v_x, v_y [m/s] and yaw rate [rad/s]
@@ -94,8 +95,10 @@ class Keyboard(Operator):
     def __enter__(self) -> "Keyboard":
         """Read single keys from now on."""
         if sys.stdin.isatty():
-            flags, *others = self._terminal = termios.tcgetattr(sys.stdin)
-            termios.tcsetattr(sys.stdin, termios.TCSANOW, [flags & ~termios.IXON, *others])  # Ctrl-S stops no output
+            flags, *others, keys = self._terminal = termios.tcgetattr(sys.stdin)
+            keys = [b"\0" if place in (termios.VSUSP, termios.VQUIT) else key for place, key in enumerate(keys)]
+            settings = [flags & ~termios.IXON, *others, keys]  # Ctrl-S stops no output, Ctrl-Z and Ctrl-\ no program
+            termios.tcsetattr(sys.stdin, termios.TCSANOW, settings)
             tty.setcbreak(sys.stdin)
         return self
 
@@ -206,8 +209,9 @@ class Gamepad(Operator):
             self._sticks[:] = self._controller.velocity_command[:] = 0.0
             self.note = "the gamepad is gone"
         for _, value, kind, number in EVENT.iter_unpack(events):
-            if kind == BUTTON and value and number in BUTTONS:
-                self.ask(BUTTONS[number])
+            mode = BUTTONS.get(number) if kind & ~NOT_NEW == BUTTON and value else None
+            if mode and (kind == BUTTON or mode == Mode.DAMPING):
+                self.ask(mode)
             elif kind & ~NOT_NEW == AXIS and number in AXES:
                 self._sticks[AXES[number]] = -value / FULL
                 beyond = np.maximum(np.abs(self._sticks) - DEAD, 0.0) / (1.0 - DEAD)

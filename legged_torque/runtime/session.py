@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.interface import Transport
+from legged_torque.runtime.interface import Received, Transport
 
 FAREWELL = 0.1  # seconds in which damping is sent at the end
 
@@ -39,7 +39,10 @@ class Session:
 
     def tick(self, now: float, missed: bool) -> None:
         """Listen, decide, and tell the drives; see :class:`~legged_torque.runtime.loop.RealTimeLoop`."""
-        received = self._transport.receive()
+        try:
+            received = self._transport.receive()
+        except Exception as error:  # whatever it is, the robot must be told to damp
+            received = Received(problems=[f"{type(error).__name__}: {error}"])
         new = {"messages": int(received.newest is not None), "damaged": received.wrong_crc}
         self.counts.update(new | {"lost": received.lost, "late": received.late, "missed deadlines": int(missed)})
         before = self.controller.reason

@@ -6,6 +6,7 @@ import functools
 import http
 import ipaddress
 import logging
+import os
 import secrets
 import socket
 import warnings
@@ -26,6 +27,7 @@ from legged_torque.viewer.training_viewer import free_port
 
 MAX_MESSAGE = 2**16  # bytes of a message from a browser; longer ones end the connection
 LOGGERS = ("asyncio", "websockets.server")  # quote what clients send wrong, which could fill the disk
+TOKEN = "LEGGED_TORQUE_TOKEN"  # variable of the environment with the token for the next server, in place of a new one
 VERSION = f"viser-v{viser.__version__}"  # of pages that may connect; viser prints all others
 
 
@@ -51,8 +53,9 @@ class GuardedServer(viser.ViserServer):
 
     def __init__(self, host: str, port: int, label: str) -> None:
         """Serve at a port or the next free one. A token is required unless the address is a loopback address."""
-        self.token = "" if is_local(host) else secrets.token_hex(16)
-        self._cookie = f"legged_torque_{secrets.token_hex(4)}"  # cookies are shared by all ports of a machine
+        self.token = "" if is_local(host) else os.environ.get(TOKEN) or secrets.token_hex(16)
+        port = free_port(host, port)
+        self._cookie = f"legged_torque_{port}"  # cookies are shared by all ports of a machine
         start = websockets.asyncio.server.serve
 
         def serve(*args: Any, process_request: Callable[..., Response | None], **settings: Any) -> Any:
@@ -60,7 +63,7 @@ class GuardedServer(viser.ViserServer):
             return start(*args, **settings)
 
         with mock.patch.object(websockets.asyncio.server, "serve", serve):  # viser has no hook for requests
-            super().__init__(host, free_port(host, port), label=label, verbose=False)
+            super().__init__(host, port, label=label, verbose=False)
         for name in LOGGERS:
             logging.getLogger(name).setLevel(logging.CRITICAL)
         warnings.filterwarnings("ignore", r"\[viser\]")  # as do the loggers
@@ -73,7 +76,8 @@ class GuardedServer(viser.ViserServer):
     @property
     def url(self) -> str:
         """Address of the page for a browser on this machine, with the token if one is needed."""
-        host = "127.0.0.1" if self.get_host() == "0.0.0.0" else self.get_host()
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.get_host(), self.get_host())
+        host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.get_port()}" + (f"/?token={self.token}" if self.token else "")
 
     async def _receive(self, client: Any, message: Message) -> None:

@@ -12,6 +12,7 @@ from legged_torque.envs.base.asset import Asset
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.mjcf import joint_limits
 from legged_torque.viewer.session import HISTORY_STEPS, Session
+from legged_torque.viewer.snapshot import Snapshot
 
 Series = Iterable[tuple[str, str]]  # names and colors
 Row = tuple[str, str, Sequence[str]]  # name, color of its dot or nothing, and texts
@@ -73,7 +74,7 @@ class Plots:
         feet = np.array([one.feet for one in past[-GAIT_STEPS:]])
         self._gait.content = gait_html(self._feet, feet, GAIT_STEPS, round(GAIT_STEPS * dt, 1))
         self._bars.content = self._torque_bars(past[-1].torques, past[-1].torque_parts)
-        self._metrics.content = self._metrics_table()
+        self._metrics.content = self._metrics_table(past)
         self._rewards.content = self._reward_bars(np.mean([one.rewards for one in past[-MEAN_STEPS:]], axis=0))
         now, past = past[-1].time, past[len(past) % STRIDE :: STRIDE]  # always the same steps, against jitter
         time = np.array([one.time for one in past]) - now
@@ -94,17 +95,17 @@ class Plots:
         shown = rewards.sum(axis=1) if self._term.value == SUM else rewards[:, self._terms.index(self._term.value)]
         draw(self._reward, time, [shown[:, None]])
 
-    def _metrics_table(self) -> str:
+    def _metrics_table(self, past: list[Snapshot]) -> str:
         """Return metrics over the history, as evaluate.py measures them."""
-        sessions = [each for each in (self._session, self._session.companion) if each]
-        histories, rows = [list(each.history) for each in sessions], list[Row]()
-        for name in histories[0][0].metrics:
+        other, rows = self._session.companion, list[Row]()
+        histories = [past, *([list(other.history)] if other else [])]
+        for name in past[0].metrics:
             sums = [sum((one.metrics.get(name, np.zeros(2)) for one in past), np.zeros(2)) for past in histories]
             with np.errstate(divide="ignore", invalid="ignore"):
                 texts = [f"{above / below:.3g}" for above, below in sums]
             rows.append((f"{name.replace('_', ' ')} {UNITS[name] and f'[{UNITS[name]}]'}", "", texts))
         head = f"<b>Metrics, last {HISTORY_STEPS * self._session.task.dt:g} s</b>"
-        return table_html((head, "", ["actual", "companion"][: len(sessions)]), *rows)
+        return table_html((head, "", ["actual", "companion"][: len(histories)]), *rows)
 
     def _draw_leg(
         self, plots: Sequence[viser.GuiUplotHandle], title: str, time: np.ndarray, values: ArrayLike, limits: np.ndarray

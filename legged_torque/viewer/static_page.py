@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+import http.client
 import io
 import os
 import shutil
@@ -124,7 +125,7 @@ def library(package: str, checksum: str) -> bytes:
         try:
             with urllib.request.urlopen(REGISTRY + package, timeout=60) as answer:
                 content = answer.read()
-        except OSError as error:
+        except (OSError, http.client.HTTPException) as error:  # also if it ends too soon
             raise UserError(f"cannot download {REGISTRY}{package}, which the page needs: {error}") from None
         if not _is_genuine(content, checksum):
             raise UserError(f"{REGISTRY}{package} is not the file that was expected (sha512 differs)")

@@ -4,6 +4,7 @@ import functools
 import html
 import json
 import math
+import os
 import tempfile
 import threading
 import time
@@ -18,7 +19,7 @@ from viser._messages import RunJavascriptMessage
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.policies import policy_names
-from legged_torque.viewer.access import GuardedServer
+from legged_torque.viewer.access import TOKEN, GuardedServer
 from legged_torque.viewer.drawing import Drawing, Ground
 from legged_torque.viewer.plots import WIDTH, Plots
 from legged_torque.viewer.scene import Scene
@@ -357,8 +358,8 @@ class Page:
             self._record.label, self._record.disabled = RECORD, False
 
 
-def watch(session: Session, title: str, host: str, port: int, again: str, no_renderer: str | None = None) -> None:
-    """Serve a :class:`Page` and step until Ctrl-C; ``again`` is the command that opens it again."""
+def watch(session: Session, title: str, host: str, port: int, again: str, no_renderer: str | None = None) -> int:
+    """Serve a :class:`Page`, step until Ctrl-C, and return the port; ``again`` is the command that opens it again."""
     page = Page(session, title, host, port, no_renderer)
     if page.server.get_port() != port:
         print(f"Port {port} is taken.")
@@ -371,3 +372,5 @@ def watch(session: Session, title: str, host: str, port: int, again: str, no_ren
     finally:
         ended = f"If a training has started it, that has ended, too. Open the viewer again with: {again}"
         page.close(f"{session.chosen} comes in some seconds." if session.chosen else ended)
+    os.environ[TOKEN] = page.server.token  # browsers know no other one if another policy comes
+    return page.server.get_port()

@@ -47,6 +47,10 @@ def test_notes_of_strangers(exported, description, tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
     status, output, _ = run_here("publish.py", str(folder), root=tmp_path)
     assert status == 0 and "note: no geom's name contains \\x1b[31m" in output
+    changed["robot"]["file"] = "/home/me/a1.xml"
+    write_description(folder, changed)
+    refused = run_here("publish.py", str(folder), "--out=other", root=tmp_path)
+    assert_told_in_one_line(refused, "'/home/me/a1.xml' is a path of this machine: export anew with --set asset.file=")
 
 
 def test_one_file_is_enough(exported, description, tmp_path):

@@ -69,6 +69,24 @@ def test_the_end_comes_whatever_fails(policy, tmp_path, error):
     assert len(list(RecordedLog(tmp_path / "log.mcap").ticks())) > 2
 
 
+@pytest.mark.parametrize("walks", [False, True])
+def test_a_transport_that_receives_no_more(policy, walks):
+    """The robot is told to damp in that very tick, and at the end, which comes without an error."""
+    world = standing_at_once(policy)
+    for mode in (Mode.STAND, Mode.POLICY)[: 1 + walks]:
+        assert world.controller.request(mode) == ""
+        world.run(20)
+    assert world.robot._command.kp.any()
+    world._transport.receive = lambda: {}["state"]
+    assert world.run(1) == Mode.DAMPING and world.stops == ["KeyError: 'state'"]
+    assert world.controller.request(Mode.STAND) == world.stops[0]
+    world._transport.send = (sent := []).append
+    world.close()
+    assert len(sent) > 5
+    for command in (world.robot._command, *sent):
+        assert not command.kp.any() and not command.tau.any() and command.kd.all()
+
+
 def random_state(rng, joints=12):
     """A state of a robot that stands, with joints anywhere near."""
     q, dq, zeros = rng.normal(0.0, 0.5, joints), rng.normal(0.0, 5.0, joints), np.zeros(joints)
@@ -156,6 +174,13 @@ def test_the_wrong_robot(policy):
             with pytest.raises(UserError, match="export the policy anew"):
                 Controller(wrong, order, RATE)
         policy.description["joints"][order[3]][lacking] = had
+    timing = policy.description["timing"]
+    policy.description["timing"] = timing | {"refresh_torques": False}
+    with pytest.raises(UserError, match="hold torques of position_residual"):
+        Controller(policy, order, RATE)
+    policy.description["timing"] |= {"decimation": 1}
+    Controller(policy, order, RATE)
+    policy.description["timing"] = timing
     policy.supplied = ["felt"]
     with pytest.raises(UserError, match="observes felt"):
         Controller(policy, order, RATE)

@@ -33,7 +33,7 @@ for line in sys.stdin:  # numbers of the states to tell, 500 a second; of a nega
     for k, number in enumerate(int(word) for word in line.split()):
         time.sleep(max(0.0, start + k / 500 - time.monotonic()))
         message = unitree_go2.encode_state(RobotState(abs(number), np.zeros(4), np.zeros(3), *np.zeros((5, 12))))
-        message.crc ^= number < 0
+        message["crc"] ^= number < 0
         side.publish(message)
     heard = side.receive()
     tau = heard.newest.tau[0] if heard.newest else np.nan
@@ -108,7 +108,7 @@ def torques(value):
 def numbered(number):
     """The message of a command whose torque is its number; of a negative one the CRC is wrong."""
     message = go2.encode_command(torques(abs(number)), abs(number))
-    message.crc ^= number < 0
+    message["crc"] ^= number < 0
     return message
 
 
@@ -241,6 +241,30 @@ def test_robots_that_start_anew_and_two_at_once(transport):
             assert counts(found) == [0, 0, 0] and not any(look.problems for look in found)
             found = first.told([901], transport)
             assert any("rt/lowstate" in problem for look in found for problem in look.problems)
+
+
+def test_another_program_next_to_a_robot(robot, transport):
+    """A robot that walks is only damped until the motion switcher has answered again, and always hears of it."""
+
+    def heard_of(*sent):
+        """The torque that the robot has heard last, of those that were sent."""
+        for value in sent:
+            transport.send(torques(value))
+        time.sleep(0.2)
+        robot.tell([])
+        return robot.heard()[0]
+
+    assert heard_of(5.0) == 5.0
+    with started() as other:
+        found = []
+        while not any(look.problems for look in found):
+            other.tell([0])
+            other.heard()
+            found = looks(transport, 0.03)
+        assert heard_of(0.0, 1.0) == 0.0  # then its motion switcher has answered
+        for program in (robot, other, robot):
+            said = [problem for look in program.told([0], transport) for problem in look.problems]
+            assert said == ["two programs send rt/lowstate"] and heard_of(3.0) == 3.0
 
 
 def test_nobody_there(transport, monkeypatch):

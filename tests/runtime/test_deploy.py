@@ -124,14 +124,28 @@ def test_a_terminal_that_waits(exported, tmp_path):
     words = [str(exported), "--interface=sim", "--walk", "--seconds=1", f"--log={log}"]
     with subprocess.Popen([sys.executable, str(ROOT / "scripts" / "deploy.py"), *words], stdout=full) as process:
         os.close(full)
-        until, last = time.monotonic() + 60.0, b""
+        until, last = time.monotonic() + 120.0, b""
         while not (last.endswith(b"MCAP0\r\n") and len(last) > 1000) and time.monotonic() < until:
             time.sleep(0.1)
             last = log.read_bytes() if log.exists() else b""
         with open(end, "rb") as output:
-            output.read()
-    assert time.monotonic() < until and process.returncode == 0
+            said = output.read()
+    assert time.monotonic() < until
+    assert process.returncode == 0 or b"stopped: all deadlines" in said  # as on a busy machine
     assert [rest["mode"] for *_, rest in RecordedLog(log).ticks()][-1] == "damping"
+
+
+def test_an_output_that_nobody_reads_any_more(exported, tmp_path):
+    """As after ``| head -1``: the session goes on to its end, and ends well."""
+    log = tmp_path / "log.mcap"
+    command = [sys.executable, str(ROOT / "scripts" / "deploy.py"), str(exported)]
+    command += ["--interface=sim", "--seconds=2", f"--log={log}"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline().startswith("damping")
+        process.stdout.close()
+        assert (process.stderr.read(), process.wait()) == ("", 0)
+    ticks = [tick[0] for tick in RecordedLog(log).ticks()]
+    assert ticks[-1] - ticks[0] > 1.5
 
 
 WITHOUT_TORCH = """
@@ -186,7 +200,13 @@ def test_scripts(make_task, exported, tmp_path):
     ):
         given = [str(exported)] if script == "deploy.py" else []
         assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)
-    assert_told_in_one_line(run_here(*replay, "--limit=-1", root=tmp_path), "limit")
+    for words, message in (
+        ([*replay, "--limit=-1"], "limit"),
+        (["replay.py", "none.mcap", "--policy=none", "--plot=gap"], "a figure needs a name that ends in .png"),
+        (["replay.py", "none.mcap", "--policy=none", "--plot=/dev/null/a.png"], "cannot write '/dev/null/a.png'"),
+        (["identify.py", "."], "cannot read '.': there is no such file"),
+    ):
+        assert_told_in_one_line(run_here(*words, root=tmp_path), message)
     export_random(make_task, "a1_torque", tmp_path / "a1", **{"control.decimation": 1})  # at 200 Hz
     assert run_here("deploy.py", "a1", "--interface=sim", "--seconds=0.3", "--log=fast.mcap", root=tmp_path)[0] == 0
     assert RecordedLog(tmp_path / "fast.mcap").period == 1 / 400

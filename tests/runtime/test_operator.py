@@ -119,6 +119,8 @@ def test_gamepad(robot, tmp_path):
             ([(0, 0x82, 1), (0, 2, 3), (0, 1, 0), (1, 1, 2)], (Mode.POLICY, STILL)),  # the first after events were lost
             ([(1, 1, 1), (0, 1, 1)], (Mode.DAMPING, STILL)),
             ([(1, 1, 0), (-32767, 2, 1)], (Mode.STAND, [1.0, 0.0, 0.0])),
+            ([(0, 0x81, 1), (1, 0x81, 2)], (Mode.STAND, [1.0, 0.0, 0.0])),  # pressed while events were lost
+            ([(1, 0x81, 1)], (Mode.DAMPING, [1.0, 0.0, 0.0])),
         ):
             device.write(b"".join(struct.pack("<IhBB", 1234, *event) for event in events))
             gamepad.look()
@@ -157,6 +159,9 @@ def test_keys(robot, monkeypatch):
                 (b"s.\x1b[B\x1b[D", Mode.STAND, [0.1, 0.0, 0.1]),
                 (b"p" + b"\x1b[C" * 20, Mode.POLICY, [0.1, 0.0, -1.0]),
                 (b"0 ", Mode.DAMPING, STILL),
+                (b"s\x1a", Mode.DAMPING, STILL),  # Ctrl-Z and Ctrl-\, which would halt or end the program
+                (b"s", Mode.STAND, STILL),
+                (b"\x1c", Mode.DAMPING, STILL),
                 (b"x?q", Mode.PASSIVE, STILL),
             ):
                 os.write(master, keys)

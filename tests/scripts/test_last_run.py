@@ -5,8 +5,10 @@ import shlex
 import shutil
 
 import pytest
-from support.scripts import ROOT, assert_told_in_one_line, run_here
+from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 from support.strangers import LOADING
+
+from legged_torque.utils.policies import POLICIES_DIR
 
 FIRST, LAST = "2026-01-01_00-00-00", "2026-01-02_00-00-00"
 
@@ -72,7 +74,14 @@ def test_last_export(logs):
     pytest.importorskip("onnxruntime", reason="the extra 'export' is not installed")
     words = ["--robots=1", "--steps=2"]
     assert_told_in_one_line(run_here("sim2sim.py", *words, root=logs.parent), "there is no exported policy in 'logs'")
-    for choice in ([f"--load_run={FIRST}"], []):
+    before = contents(POLICIES_DIR)
+    for choice in ([f"--load_run={FIRST}"], [], ["--policy=a1/position"]):
         assert run_here("export.py", "--device=cpu", *choice, root=logs.parent)[0] == 0
+    assert (logs / "a1" / "position" / "exported_1119" / "policy.onnx").is_file()
+    assert contents(POLICIES_DIR) == before
     status, output, error = run_here("sim2sim.py", *words, root=logs.parent)
     assert (status, error) == (0, "") and output.startswith(f"a1_torque, model_1.pt of {LAST}, ")
+    for task in ("a1_position", "a1_torque"):
+        shutil.rmtree(logs / task)
+    status, output, error = run_here("sim2sim.py", *words, root=logs.parent)
+    assert (status, error) == (0, "") and output.startswith("a1_position, model_1119.pt of ")

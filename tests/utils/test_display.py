@@ -148,6 +148,9 @@ def test_lines(capsys):
     assert lines[1].startswith("iteration 6 of 40, 0:00:06, 0:00:34 left; steps 192; steps/s 32; KL 0.0123; ")
     assert lines[1].endswith("; tracking 0.500 (best 0.500); falls 1.5 per minute")
     assert read_progress("\n".join(lines)) == ("iteration", 15, 40, "0:00:25")
+    own = TrainingDisplay("title", "folder", 40, 0, 32, is_quiet=True)
+    own.add_iteration(1, 32, {"Evaluation/track_percentage": 0.5})  # without falls, of an evaluation of a user's own
+    assert own.line().endswith("; steps 32; tracking 0.500 (best 0.500)")
     assert read_tracking(lines[0]) == "" and read_tracking("\n".join(lines)) == "0.500"
     days = "iteration 2 of 400, 1 day, 0:13:20, 1 day, 20:13:20 left"
     assert read_progress(days) == ("iteration", 2, 400, "1 day, 20:13:20") and read_progress("nothing") is None

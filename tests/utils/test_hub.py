@@ -1,18 +1,23 @@
 """Policies that others publish: up to a stand-in for the Hugging Face Hub, and down from there."""
 
 import functools
+import runpy
+import shlex
 import shutil
+from pathlib import Path
 
 import pytest
 import yaml
 from huggingface_hub import constants
 from support import hub
-from support.scripts import assert_told_in_one_line, run_here
+from support.scripts import ROOT, assert_told_in_one_line, run_here
 
+from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
 from legged_torque.utils import devices
 from legged_torque.utils.options import Options
 from legged_torque.utils.policies import policy_dir
+from legged_torque.utils.runs import load_config
 
 FILES = {
     "README.md",
@@ -65,6 +70,29 @@ def test_up_and_down(script, server):
     server.models["me/other"] = model | {"policy.onnx": model["policy.onnx"] + b" "}
     status, _, errors = script("sim2sim.py", "hf:me/other", *few)
     assert status == 2 and errors.endswith("policy.onnx' is not the file that card.yaml describes\n")
+
+
+def test_a_run_of_this_machine(tmp_path):
+    """Its folders are not published: neither in settings nor in its command, of which all else stays."""
+    source, run, home = policy_dir("a1/position"), tmp_path / "run", "/home/some one"
+    for folder in (run / "exported", tmp_path / "out"):
+        folder.mkdir(parents=True)
+    shutil.copy(source / "policy.onnx", run / "exported")
+    shutil.copy(source / "model_1119.pt", run)
+    config = yaml.safe_load((source / "config.yaml").read_text())
+    config["env"]["asset"]["file"], config["train"]["distillation"] = f"{home}/a1.xml", {"teachers": [f"{home}/a.pt"]}
+    words = ["train.py", "--task", "a1_position", f"--log_root={home}/logs", "--task_file", f"{home}/mine.py"]
+    words += ["--set", f"distillation.teachers=[{home}/a, '{Path.cwd()}/here/b']", "--set=sim.dt=1/2"]
+    with (run / "config.yaml").open("w") as file:
+        yaml.safe_dump(config | {"command": shlex.join(words)}, file, explicit_start=True, explicit_end=True)
+    copy_policy = runpy.run_path(str(ROOT / "scripts" / "publish.py"))["copy_policy"]
+    card = copy_policy(run / "exported" / "policy.onnx", tmp_path / "out", Policy("a1/position").description)
+    command = ["train.py", "--task", "a1_position", "--log_root=logs", "--task_file", "mine.py"]
+    command += ["--set", "distillation.teachers=[a, 'here/b']", "--set=sim.dt=1/2"]
+    assert shlex.split(card["trained"]) == command
+    config["env"]["asset"]["file"], config["train"]["distillation"] = "a1.xml", {"teachers": ["a.pt"]}
+    assert load_config(tmp_path / "out") == config | {"command": card["trained"]}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"config.yaml", "model_1119.pt", "policy.onnx"}
 
 
 @pytest.mark.parametrize(

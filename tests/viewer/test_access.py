@@ -6,6 +6,8 @@ import http.client
 import socket
 import sys
 import threading
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -18,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from legged_torque.utils.errors import UserError
-from legged_torque.viewer.access import GuardedServer, is_local
+from legged_torque.viewer.access import TOKEN, GuardedServer, is_local
 from legged_torque.viewer.training_viewer import free_port
 
 FORGED = {
@@ -128,6 +130,32 @@ def test_token():
         assert get(port, "/index.html", Cookie=kept) == (200, "")
         assert connects(port, "robots.example", f"http://robots.example:{port}", kept)
         assert not connects(port, "robots.example", "http://evil.example", kept)
+
+
+def test_another_server_in_its_place(monkeypatch):
+    """At the same port and with the token of the first one, it knows the browsers that did."""
+    with serving("0.0.0.0") as (port, token):
+        kept = get(port, f"/?token={token}")[1].split(";")[0]
+    monkeypatch.setenv(TOKEN, token)
+    with serving("0.0.0.0") as again:
+        assert again == (port, token) and connects(port, cookie=kept)
+    monkeypatch.setenv(TOKEN, "")
+    with serving("0.0.0.0") as (port, other):
+        assert len(other) == 32 and not connects(port, cookie=kept)
+
+
+@pytest.mark.skipif(not Path("/proc/net/if_inet6").exists(), reason="this machine has no IPv6")
+@pytest.mark.parametrize(("host", "shown"), [("::1", "::1"), ("::", "::1")])
+def test_addresses_of_version_6(host, shown):
+    """Browsers want them in brackets, and one of this machine."""
+    server = GuardedServer(host, 8440, "title")
+    parts, address = urlsplit(server.url), f"http://[{shown}]:{server.get_port()}"
+    assert server.url == address + (f"/?token={server.token}" if host == "::" else "")
+    connection = http.client.HTTPConnection(parts.hostname, parts.port, timeout=120)
+    connection.request("GET", f"/?{parts.query}")
+    assert connection.getresponse().status == 200
+    connection.close()
+    server.stop()
 
 
 @pytest.mark.parametrize(

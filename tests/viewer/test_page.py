@@ -1,8 +1,10 @@
 """The page without a browser: robots of all kinds, and errors that must not end it."""
 
 import contextlib
+import os
 import re
 import threading
+from collections import deque
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 
 from support.clock import Clock, wait_for
 from support.published import urdf
+from support.scripts import run_here
 from support.sessions import new_session, running
 from support.visitor import visitor
 
@@ -20,7 +23,8 @@ from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
 from legged_torque.utils.policies import POLICIES_DIR, name_of, policy_names
-from legged_torque.viewer import scene
+from legged_torque.viewer import scene, web
+from legged_torque.viewer.access import TOKEN
 from legged_torque.viewer.plots import gait_html, joints_by_leg
 from legged_torque.viewer.video import VideoRecorder
 from legged_torque.viewer.web import RECORD, Page, watch
@@ -162,10 +166,40 @@ def test_controls_follow_the_session(page):
 def test_what_is_printed(page, monkeypatch, capsys, host, is_open):
     """The address, with a token and a warning if other machines reach it."""
     monkeypatch.setattr(page.session, "run", lambda: None)
-    watch(page.session, "title", host, 8470, "play.py")
+    monkeypatch.setenv(TOKEN, "")
+    port = watch(page.session, "title", host, 8470, "play.py")
     printed = capsys.readouterr().out
-    assert re.search(r"^See it walk: http://127\.0\.0\.1:\d+(/\?token=\w{32})? ", printed, re.MULTILINE)
+    found = re.search(r"^See it walk: http://127\.0\.0\.1:(\d+)(?:/\?token=(\w{32}))? ", printed, re.MULTILINE)
+    assert found.groups("") == (str(port), os.environ[TOKEN])
     assert ("Warning: other machines reach this page" in printed) == ("?token=" in printed) == is_open
+
+
+class Cleared(deque):
+    """A history that is cleared as soon as it has been read."""
+
+    def __iter__(self):
+        """Read and clear it."""
+        steps = list(super().__iter__())
+        self.clear()
+        return iter(steps)
+
+
+def test_another_policy(tmp_path, monkeypatch):
+    """It comes at the same address and on the same device, however often."""
+    started = []
+
+    def choose(session, **_):
+        """Choose a policy on a page whose port was not the one that was asked for."""
+        session.stop("go2/position")
+        return 8491
+
+    monkeypatch.setattr(web, "watch", choose)
+    monkeypatch.setattr(os, "execv", lambda _, words: started.append(words))
+    play = ["--policy=a1/position", "--viewer=web", "--num_envs=1", "--device=cpu", "--host=127.0.0.2", "--port=8490"]
+    assert run_here("play.py", *play, root=tmp_path)[0] == 0
+    assert run_here("demo.py", *started[0][2:], root=tmp_path)[0] == 0
+    for words in started:
+        assert {*words[2:]} == {"go2/position", "--host=127.0.0.2", "--port=8491", "--device=cpu"}
 
 
 def test_metrics(tmp_path):
@@ -189,6 +223,9 @@ def test_metrics(tmp_path):
     cost = float(rows["cost of transport "])
     assert cost == pytest.approx(np.mean(power) / (weight * np.mean(speed)), rel=0.01)
     page.close()
+    before, page._plots._metrics.content, session.history = page._plots._metrics.content, "", Cleared(session.history)
+    page._plots.update()
+    assert page._plots._metrics.content == before
 
 
 def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch):

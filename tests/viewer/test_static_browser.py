@@ -94,6 +94,7 @@ def test_page(browser, served):
     browser.find_element(By.ID, "push").click()
     browser.find_element(By.ID, "stop").click()
     assert browser.execute_script("return simulation.command") == [0, 0, 0]
+    assert browser.execute_script(SCRIPTS["keys"]) == [[0, 0, 0], True]
     for width in (1920, 1280, 390):
         with screen(browser, width, 800, 0.1):  # few pixels are drawn
             assert browser.execute_script("return document.documentElement.scrollWidth") <= width

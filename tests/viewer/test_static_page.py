@@ -1,6 +1,8 @@
 """What a published page refuses, and files that it takes along; test_static_browser.py opens it."""
 
 import copy
+import socket
+import threading
 from types import SimpleNamespace
 
 import mujoco
@@ -50,6 +52,14 @@ def test_files_of_the_robot(tmp_path):
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml")).body_mass[1] == pytest.approx(mass)
 
 
+def answer_in_part(server):
+    """Announce more bytes than follow."""
+    connection, _ = server.accept()
+    with connection:
+        connection.recv(4096)
+        connection.sendall(b"HTTP/1.1 200 OK\r\nContent-Length: 99\r\n\r\npart")
+
+
 def test_libraries(tmp_path, monkeypatch):
     """Without the registry, and with another file than the one that is expected, nothing is used."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
@@ -57,6 +67,11 @@ def test_libraries(tmp_path, monkeypatch):
     package, (checksum, _) = next(iter(static_page.PACKAGES.items()))
     with pytest.raises(UserError, match=r"cannot download http://127.0.0.1:9/@mujoco"):
         static_page.library(package, checksum)
+    with socket.create_server(("127.0.0.1", 0)) as cut_off:
+        threading.Thread(target=answer_in_part, args=(cut_off,)).start()
+        monkeypatch.setattr(static_page, "REGISTRY", f"http://127.0.0.1:{cut_off.getsockname()[1]}/")
+        with pytest.raises(UserError, match="cannot download"):
+            static_page.library(package, checksum)
     (tmp_path / "other.tgz").write_bytes(b"other")
     monkeypatch.setattr(static_page, "REGISTRY", tmp_path.as_uri() + "/")
     with pytest.raises(UserError, match=r"other.tgz is not the file that was expected"):

@@ -66,14 +66,16 @@ function controls(page, simulation) {
   const sliders = COMMANDS.map(element);
   sliders.forEach((slider, i) => {
     [slider.min, slider.max] = ranges[i];
+    slider.value = 0;
+    if (slider.valueAsNumber !== 0) slider.step = "any"; // no step leads there, and the robot could not stand
     slider.value = i ? 0 : 0.5 * ranges[i][1];
   });
   const steer = () => (simulation.command = sliders.map((slider) => Number(slider.value)));
   sliders.forEach((slider) => slider.addEventListener("input", steer));
   steer();
-  document.addEventListener("keydown", ({ key, repeat }) => {
-    const [i, direction] = KEYS[key.toLowerCase()] ?? [];
-    if (i === undefined || repeat) return;
+  document.addEventListener("keydown", ({ key, repeat, ctrlKey, metaKey, altKey }) => {
+    const [i, direction] = KEYS[key?.toLowerCase()] ?? []; // of what a browser fills in there is none
+    if (i === undefined || repeat || ctrlKey || metaKey || altKey) return;
     sliders[i].value = Number(sliders[i].value) + 0.25 * direction * ranges[i][1];
     steer();
   });
