@@ -125,6 +125,8 @@ def say(write: Callable[[], None]) -> None:
     """Write to standard output; once that fails, as behind ``| head``, all goes nowhere: the robot must walk on."""
     try:
         write()
+    except BlockingIOError:  # full just now
+        pass
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 

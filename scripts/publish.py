@@ -29,7 +29,7 @@ from legged_torque.utils.runs import CONFIG_FILE, load_config
 
 ROBOTS, STEPS, SHOWN_STEPS = 16, 500, 250
 VIDEO = "replay.mp4"  # the name that Hugging Face shows
-ABSOLUTE = re.compile(r"(?<![^\s=\[{,:'\"])/[^\]},'\"]+")  # a path in a word of a command, also one of a list
+ABSOLUTE = re.compile(r"(?<![^\s=\[{,'\"])/[^\]},'\"]+")  # a path in a word of a command, also one of a list
 README = """\
 ---
 library_name: legged_torque

@@ -135,8 +135,8 @@ class Go2Robot(_Side):
     """A robot, real or simulated, as the program sees it: a :class:`~legged_torque.runtime.interface.Transport`.
 
     States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message. While the robot's sport
-    mode is not released, that is a problem, and no command is sent. A robot that starts anew is asked anew; meanwhile
-    only damping is sent, as the new sender may be another program next to a robot that walks.
+    mode is not released, that is a problem, and no command is sent. A new sender of states is asked anew. Until it
+    answers, damping is sent: it may be another program next to a robot that walks.
     """
 
     writes, reads = (LowCmd_, Request_), (LowState_, Response_)
@@ -160,7 +160,7 @@ class Go2Robot(_Side):
     def send(self, command: MotorCommand) -> None:
         """Tell the drives, once they are free; raises MessageError if a number is not finite."""
         is_damping = not (command.kp.any() or command.tau.any())
-        if not self._release.problem or (self._sent and is_damping):
+        if not self._release.problem or (self._sent and is_damping and not self._release.mode):
             self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
             self.publish(unitree_go2.encode_command(command, self._sent))
 

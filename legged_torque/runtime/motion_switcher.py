@@ -39,6 +39,7 @@ class Release:
 
     Attributes:
         problem: Why the motors must not be driven yet; empty when no mode holds them.
+        mode: The mode that was found to hold them; empty if none was.
     """
 
     def __init__(self, write: Callable[[Any], None], is_optional: bool) -> None:
@@ -49,6 +50,7 @@ class Release:
     def begin(self) -> None:
         """Ask anew, as a robot may have been switched on again."""
         self.problem, self._number, self._next, self._absent_at = "the motion switcher does not answer", 0, 0.0, np.inf
+        self.mode = ""
 
     def look(self, responses: list[Any], now: float) -> None:
         """Take answers, and ask for what is missing, at a time [s]. An answer that cannot be read is a mode."""
@@ -63,11 +65,11 @@ class Release:
                 self.problem = f"the motion switcher answers with error {code}"
             elif identity.api_id == CHECK_MODE:
                 try:
-                    mode = json.loads(response.data)["name"]
+                    self.mode = json.loads(response.data)["name"]
                 except (ValueError, KeyError, TypeError):
-                    mode = response.data
-                self.problem = f"the sport mode '{mode}' holds the motors" if mode else ""
-                if mode:
+                    self.mode = response.data
+                self.problem = f"the sport mode '{self.mode}' holds the motors" if self.mode else ""
+                if self.mode:
                     self._ask(RELEASE_MODE, now)
         if now > self._absent_at:
             self.problem = ""

@@ -79,6 +79,11 @@ class Message:
             return cls()
         return cls(list(layout.unpack_from(data, len(_CDR))))
 
+    @classmethod
+    def deserialize_key(cls, data: bytes) -> "Message":
+        """Return a blank message, in which cyclonedds wraps the news that the other side has left."""
+        return cls()
+
 
 def _type(name: str, **members: Any) -> Any:
     """Return a type of DDS with members of some types; an array has a type and a length."""
@@ -161,7 +166,7 @@ _LAYOUTS = {
 _STATES = [0] * IMUState_.size + [SERVO, *[0] * (MotorState_.size - 1)] * SLOTS
 _PARTS: dict[Any, list[Any]] = {LowCmd_: _IDLE * SLOTS, LowState_: _STATES}
 for _kind, _layout in _LAYOUTS.items():
-    for _name in ("__init__", "__getitem__", "__setitem__", "serialize", "deserialize"):
+    for _name in ("__init__", "__getitem__", "__setitem__", "serialize", "deserialize", "deserialize_key"):
         setattr(_kind, _name, vars(Message)[_name])  # cyclonedds would take a base class for a part of the message
     _unpadded = _layout.replace("H2xB3x", "HBx").replace("B3xB3x", "BB2x")
     _kind.c_layout = struct.Struct("<" + _layout)

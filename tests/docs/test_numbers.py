@@ -273,9 +273,10 @@ def test_students():
     assert "{:.1f}, {:.1f} and {:.1f}% fewer cross".format(*fewer.max(axis=1)) in text
     students = ("student", *(f"student, {n} million" for n in (120, 240)))
     later = [less(numbers, name, trained) for name in students[1:] for numbers in (tracked, crossed)]
+    assert [len(each) for each in later] == [3, 3, 2, 2]
     assert f"track at most {later[0].to_numpy().max():.1f}% less" in text
     assert "{:.1f}, {:.1f} and {:.1f}% fewer cross the worst kind (standard".format(*later[1].max(axis=1)) in text
-    assert "240 million (second A1, Go2), {:.1f} and {:.1f}%".format(*later[3].max(axis=1)) in text
+    assert "240 million are no better: {:.1f} and {:.1f}% (second A1, Go2)".format(*later[3].max(axis=1)) in text
     stones = pd.concat([less(tracked, name, ["stepping_stones"]) for name in students]).to_numpy()
     assert f"students track {stones.min():.0f} to {stones.max():.0f}% less" in text
 

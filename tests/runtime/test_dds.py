@@ -201,6 +201,13 @@ def test_the_sport_mode_is_released_first(transport, monkeypatch):
             assert robot.heard()[0] == 2.0
 
 
+def test_a_robot_that_leaves(transport):
+    """The news that nobody tells states any more is no state, and no error."""
+    with started() as robot:
+        robot.meet(transport)
+    assert not any(look.newest for look in looks(transport, 0.5)[-10:])
+
+
 def test_answers_of_the_motion_switcher():
     """A mode is released; stale answers, errors and those that cannot be read release nothing. Requests are CDR."""
     sent, service = [], SportMode()
@@ -213,7 +220,7 @@ def test_answers_of_the_motion_switcher():
         (0.4, [2], "", 3),
     ):
         release.look([service.answer(sent[i]) for i in answered], now)
-        assert (release.problem, len(sent)) == (problem, count)
+        assert (release.problem, len(sent)) == (problem, count) and bool(release.mode) == ("holds" in problem)
     for code, data, said in ((3104, "", "error 3104"), (0, "{", "'{'"), (0, '{"form": 0}', "form")):
         release.begin()
         release.look([], 1.0)

@@ -159,7 +159,7 @@ class BaseTask(VecEnv):
         return {"total_steps": self.total_steps.clone(), "num_diverged": self.num_diverged.clone(), **share}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Continue from those of a checkpoint."""
+        """Continue from the :meth:`state_dict` of a checkpoint."""
         self.total_steps.copy_(state["total_steps"])
         self.num_diverged.copy_(state["num_diverged"])
         if (ranges := self.command_generator.curriculum) and "command_ranges" in state:

@@ -42,7 +42,7 @@ class PairContacts:
 
 @wp.struct
 class BoxContacts:
-    """The same, with room for those of two boxes; a struct of this size costs kernels without boxes a fifth."""
+    """The same, with room for those of two boxes; kernels that have it spill more registers."""
 
     count: wp.int32
     dist: vec8
