@@ -87,16 +87,13 @@ def put(sim, states):
 
 
 SELF_SCRATCH = {
-    "sphere",
-    "lin_vel",
-    "ang_vel",
-    "x_axis",
-    "z_axis",
+    "place",
     "found",
     "residual",
     "pushing",
     "change",
-    "geoms",
+    "of_pair",
+    "dist",
     "normal",
     "jacobian",
     "joints",

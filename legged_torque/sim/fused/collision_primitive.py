@@ -8,7 +8,7 @@ from legged_torque.sim.fused.types import AnyPairContacts, mat23, mat83, vec8
 MAX_CORNERS = wp.constant(8)
 """Of a polygon."""
 NEVER = wp.constant(1.0e30)
-TINY = wp.constant(1.0e-30)
+TINY = wp.constant(1.0e-18)
 PARALLEL = wp.constant(1.0e-8)
 """Lines whose directions have less than this squared sine of an angle between them are parallel."""
 EDGE_NOISE = wp.constant(1.0e-7)

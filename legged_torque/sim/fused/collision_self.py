@@ -21,8 +21,8 @@ from legged_torque.sim.fused.collision_primitive import (
     sphere_capsule,
     sphere_sphere,
 )
-from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params, with_rows
-from legged_torque.sim.fused.math import group_sum, lowest_bit, quat_to_matrix, sum_before, sync_group
+from legged_torque.sim.fused.constraint import Contact, ContactParams, contact_params
+from legged_torque.sim.fused.math import column, group_sum, lowest_bit, quat_to_matrix, sum_before, sync_group
 from legged_torque.sim.fused.model import Model, of_world
 from legged_torque.sim.fused.smooth import Poses
 from legged_torque.sim.fused.tree import Tree
@@ -37,6 +37,8 @@ WORD = wp.constant(32)
 """Pairs that a thread looks at before all threads of its world say what they have found: bits of a number."""
 SPHERE = wp.constant(2)
 """MuJoCo's mjGEOM_SPHERE."""
+REACH, X_AXIS, Z_AXIS = wp.constant(3), wp.constant(4), wp.constant(7)
+"""Where a geom's numbers have the radius of a sphere around it, and two of its axes; its position is first."""
 OVERFLOW = wp.constant(int(mjw.OverflowType.NARROWPHASE))
 
 
@@ -55,21 +57,18 @@ class SelfContacts:
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
     # Scratch; worlds are last where threads read and write neighbours:
-    lin_vel: wp.array3d(dtype=wp.vec3)  # (branch, depth, world): of the body, at the trunk's origin
-    ang_vel: wp.array3d(dtype=wp.vec3)
-    sphere: wp.array2d(dtype=vec4)  # (geom, world): position from there, and the radius of a sphere around the geom
-    x_axis: wp.array2d(dtype=vec4)  # of the geom, with a 0 behind, so that it is read at once
-    z_axis: wp.array2d(dtype=vec4)
+    place: wp.array3d(dtype=wp.float32)  # (geom, 10, world): position from the trunk's origin, see REACH, X_AXIS, Z_AXIS
     near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, those of each thread in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)
     pushing: wp.array(dtype=vec4)
     change: wp.array(dtype=vec4)
-    geoms: wp.array(dtype=wp.vec2i)  # of each contact
+    of_pair: wp.array(dtype=wp.int32)  # of each contact: its pair
+    dist: wp.array(dtype=wp.float32)  # of each contact, negative [m]
     normal: wp.array(dtype=wp.vec3)  # of each contact, from the first geom to the second
     jacobian: wp.array2d(dtype=wp.vec3)  # (contact, joint): motion of the second body less that of the first
     pushed: wp.array2d(dtype=wp.vec3)  # (contact, joint): its stiffness times that motion
-    joints: wp.array2d(dtype=wp.float32)  # (world, joint): accelerations, or a step
+    joints: wp.array2d(dtype=wp.float32)  # (world, joint): a step
     matrix: wp.array3d(dtype=wp.float32)  # (world, row, column): the whole Newton system, see ``constraint_self``
     # Out:
     overflow: wp.array(dtype=wp.int32)  # MuJoCo Warp's, of each world
@@ -97,7 +96,7 @@ def pair_kinds(model: mujoco.MjModel) -> tuple[tuple[int, int], ...]:
 
 def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree, data: mjw.Data) -> SelfContacts:
     """Return the pairs of a robot and room for their contacts, on the current device."""
-    (branches, depth), worlds, joints = tree.joints.shape, data.nworld, model.nv - 6
+    branches, worlds, joints = len(tree.joints), data.nworld, model.nv - 6
     out, pairs = SelfContacts(), ordered_pairs(model)
     out.pair = wp.array(pairs, dtype=wp.vec2i)
     named = {frozenset(pair): i for i, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
@@ -112,11 +111,11 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
     owners = [tree.geom_places[geom][0] for geom in geoms]
     out.geom = wp.array(geoms, dtype=wp.int32)
     out.geom_start = wp.array(np.searchsorted(owners, range(branches + 1)), dtype=wp.int32)
-    out.lin_vel, out.ang_vel = (wp.empty((branches, depth + 1, worlds), dtype=wp.vec3) for _ in range(2))
-    out.sphere, out.x_axis, out.z_axis = (wp.empty((model.ngeom, worlds), dtype=vec4) for _ in range(3))
+    out.place = wp.empty((model.ngeom, Z_AXIS + 3, worlds), dtype=wp.float32)
     out.near = wp.empty((len(pairs), worlds), dtype=wp.int32)
     room = worlds * MAX_SELF_CONTACTS
-    out.found, out.geoms, out.normal = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.vec2i, wp.vec3))
+    out.found, out.of_pair = (wp.empty(room, dtype=dtype) for dtype in (Contact, wp.int32))
+    out.normal, out.dist = (wp.empty(room, dtype=dtype) for dtype in (wp.vec3, wp.float32))
     out.residual, out.pushing, out.change = (wp.empty(room, dtype=vec4) for _ in range(3))
     out.jacobian, out.pushed = (wp.empty((room, joints), dtype=wp.vec3) for _ in range(2))
     out.joints = wp.empty((worlds, joints), dtype=wp.float32)
@@ -126,12 +125,25 @@ def make_self_contacts(model: mujoco.MjModel, warp_model: mjw.Model, tree: Tree,
 
 
 @wp.func
+def read_place(selves: SelfContacts, world: int, geom: int, first: int) -> wp.vec3:
+    """Return three of the numbers that say where a geom is, from one on."""
+    x, y = selves.place[geom, first, world], selves.place[geom, first + 1, world]
+    return wp.vec3(x, y, selves.place[geom, first + 2, world])
+
+
+@wp.func
+def write_place(selves: SelfContacts, world: int, geom: int, first: int, value: wp.vec3):
+    """Write three of these numbers."""
+    for k in range(3):
+        selves.place[geom, first + k, world] = value[k]
+
+
+@wp.func
 def shape_of(model: Model, selves: SelfContacts, world: int, geom: int) -> Shape:
     """Return a geom in the world."""
-    sphere, x, z = selves.sphere[geom, world], selves.x_axis[geom, world], selves.z_axis[geom, world]
-    x_axis, z_axis = wp.vec3(x[0], x[1], x[2]), wp.vec3(z[0], z[1], z[2])
+    x_axis, z_axis = read_place(selves, world, geom, X_AXIS), read_place(selves, world, geom, Z_AXIS)
     rot = wp.matrix_from_cols(x_axis, wp.cross(z_axis, x_axis), z_axis)
-    return Shape(wp.vec3(sphere[0], sphere[1], sphere[2]), rot, of_world(model.geom_size, world, geom))
+    return Shape(read_place(selves, world, geom, 0), rot, of_world(model.geom_size, world, geom))
 
 
 @wp.func
@@ -148,26 +160,22 @@ def reach_of(model: Model, world: int, geom: int) -> float:
 
 @wp.func
 def write_parts(model: Model, selves: SelfContacts, world: int, b: int, poses: Poses):
-    """Write where the geoms of a branch are, and how its bodies move, for the other threads of its world."""
-    for d in range(poses.shape[0]):
-        selves.lin_vel[b, d, world] = poses[d].lin_vel
-        selves.ang_vel[b, d, world] = poses[d].ang_vel
+    """Write where the geoms of a branch are, for the other threads of its world."""
     for i in range(selves.geom_start[b], selves.geom_start[b + 1]):
         geom = selves.geom[i]
         pose = poses[selves.geom_place[geom][1]]
-        pos = pose.pos + pose.rot * of_world(model.geom_pos, world, geom)
         rot = pose.rot * quat_to_matrix(of_world(model.geom_quat, world, geom))
-        selves.sphere[geom, world] = vec4(pos[0], pos[1], pos[2], reach_of(model, world, geom))
-        selves.x_axis[geom, world] = vec4(rot[0, 0], rot[1, 0], rot[2, 0], 0.0)
-        selves.z_axis[geom, world] = vec4(rot[0, 2], rot[1, 2], rot[2, 2], 0.0)
+        write_place(selves, world, geom, 0, pose.pos + pose.rot * of_world(model.geom_pos, world, geom))
+        selves.place[geom, REACH, world] = reach_of(model, world, geom)
+        write_place(selves, world, geom, X_AXIS, column(rot, 0))
+        write_place(selves, world, geom, Z_AXIS, column(rot, 2))
 
 
 @wp.func
 def are_near(selves: SelfContacts, world: int, geoms: wp.vec2i) -> bool:
     """Return whether spheres around two geoms overlap."""
-    first, second = selves.sphere[geoms[0], world], selves.sphere[geoms[1], world]
-    apart = wp.vec3(second[0] - first[0], second[1] - first[1], second[2] - first[2])
-    reach = first[3] + second[3]
+    apart = read_place(selves, world, geoms[1], 0) - read_place(selves, world, geoms[0], 0)
+    reach = selves.place[geoms[0], REACH, world] + selves.place[geoms[1], REACH, world]
     return wp.length_sq(apart) <= reach * reach
 
 
@@ -177,11 +185,10 @@ def are_separate(model: Model, selves: SelfContacts, world: int, geoms: wp.vec2i
 
     A sphere counts as a capsule, which is longer if the file gives it a second size.
     """
-    is_box = model.geom_type[geoms[1]] == BOX
     separate = bool(False)
-    if not (is_box and model.geom_type[geoms[0]] == BOX):
+    if model.geom_type[geoms[0]] != BOX:
         a, b = shape_of(model, selves, world, geoms[0]), shape_of(model, selves, world, geoms[1])
-        if is_box:
+        if model.geom_type[geoms[1]] == BOX:
             separate = between_capsule_and_box(a, b)
         else:
             separate = between_capsules(a, b)
@@ -194,16 +201,16 @@ def write_near(model: Model, selves: SelfContacts, world: int, thread: int, thre
 
     Few are near. Threads collect these before they look closer, or they would wait for each other at every pair.
     """
-    end = int(0)
-    for word in range(0, selves.pair.shape[0], WORD * threads):
+    end, pairs = int(0), selves.pair.shape[0]
+    for word in range(0, pairs, WORD * threads):
         start = word + thread
         near, may_touch = int(0), int(0)  # a bit for each pair of this thread
         k = int(0)
         while k < WORD:
-            for i in range(AT_ONCE):
+            for i in range(AT_ONCE):  # a condition on the pair would keep their reads apart
                 pair = start + (k + i) * threads
-                if pair < selves.pair.shape[0]:
-                    near |= wp.where(are_near(selves, world, selves.pair[pair]), 1 << (k + i), 0)
+                is_near = are_near(selves, world, selves.pair[wp.min(pair, pairs - 1)])
+                near |= wp.where(pair < pairs, wp.where(is_near, 1 << (k + i), 0), 0)
             k += AT_ONCE
         number = float(0.0)
         while near != 0:
@@ -235,25 +242,15 @@ _COLLIDE: dict[tuple[int, int], wp.Function] = {
 
 
 @wp.func
-def make_self_contact(
-    model: Model, selves: SelfContacts, world: int, pair: int, dist: float, pos: wp.vec3, normal: wp.vec3
-) -> Contact:
-    """Return a contact of a pair at a place [m], of a negative distance [m], with a normal to the second geom."""
-    geoms = selves.pair[pair]
-    contact = Contact()
-    contact.pos = pos
-    contact.tangent = contact_tangent(normal, wp.vec3(0.0), False)
-    first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
-    velocity = selves.lin_vel[second[0], second[1], world] - selves.lin_vel[first[0], first[1], world]
-    ang_vel = selves.ang_vel[second[0], second[1], world] - selves.ang_vel[first[0], first[1], world]
-    velocity += wp.cross(ang_vel, pos)
-    params = contact_params(model, world, geoms[0], geoms[1])
+def pair_params(model: Model, selves: SelfContacts, world: int, pair: int) -> ContactParams:
+    """Return friction and softness of a pair's contacts: its own, or those of its geoms."""
+    params = contact_params(model, world, selves.pair[pair][0], selves.pair[pair][1])
     named = selves.named[pair]
     if named >= 0:
         friction = of_world(selves.pair_friction, world, named)[0]
         solref, solimp = of_world(selves.pair_solref, world, named), of_world(selves.pair_solimp, world, named)
         params = ContactParams(friction, solref, solimp)
-    return with_rows(model, world, geoms, params, dist, velocity, normal, contact)
+    return params
 
 
 @functools.cache
@@ -265,7 +262,7 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
     def find_self_contacts(model: Model, selves: SelfContacts, world: int, thread: int) -> Touching:
         """Write a world's contacts between parts of the robot, in the order of near pairs, and return their range.
 
-        Each thread collides one pair at a time, after all parts have been written.
+        Each thread collides one pair at a time, after all parts have been written. Their rows are not written yet.
         """
         first_contact = world * MAX_SELF_CONTACTS
         last = first_contact + MAX_SELF_CONTACTS
@@ -274,7 +271,7 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
         sync_group(wp.static(threads))
         for start in range(0, near, wp.static(threads)):
             touch = Contacts()
-            pair, geoms = int(0), wp.vec2i(0, 0)
+            pair = int(0)
             if start + thread < near:
                 pair = selves.near[start + thread, world]
                 geoms = selves.pair[pair]
@@ -288,11 +285,13 @@ def self_contact_finder(kinds: tuple[tuple[int, int], ...], threads: int) -> wp.
                 place = end + int(sum_before(float(touch.count), thread, wp.static(threads)))
                 for i in range(touch.count):
                     if place + i < last:
-                        selves.geoms[place + i] = geoms
+                        contact = Contact()
+                        contact.pos = touch.pos[i]
+                        contact.tangent = contact_tangent(touch.normal[i], wp.vec3(0.0), False)
+                        selves.found[place + i] = contact
+                        selves.of_pair[place + i] = pair
                         selves.normal[place + i] = touch.normal[i]
-                        selves.found[place + i] = make_self_contact(
-                            model, selves, world, pair, touch.dist[i], touch.pos[i], touch.normal[i]
-                        )
+                        selves.dist[place + i] = touch.dist[i]
                 end += new
         if end > last and thread == 0:
             selves.overflow[world] = selves.overflow[world] | OVERFLOW

@@ -7,10 +7,10 @@ so that they cannot be eliminated one by one: then all threads of the world fact
 
 import warp as wp
 
-from legged_torque.sim.fused.collision_self import SelfContacts, Touching
-from legged_torque.sim.fused.constraint import contact_force, contact_stiffness, expected_rows, row_values
+from legged_torque.sim.fused.collision_self import SelfContacts, Touching, pair_params
+from legged_torque.sim.fused.constraint import contact_force, contact_stiffness, expected_rows, row_values, with_rows
 from legged_torque.sim.fused.math import column, group_sum, group_sum3, inverse_sqrt, sync_group, with_column
-from legged_torque.sim.fused.model import Model
+from legged_torque.sim.fused.model import Model, State
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
 from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
 
@@ -23,7 +23,7 @@ def hinge_index(model: Model, b: int, j: int) -> int:
 
 @wp.func
 def write_joints(model: Model, selves: SelfContacts, world: int, b: int, joints: int, values: AnyVector):
-    """Write the accelerations of a branch's joints, or their step, for the other threads of its world."""
+    """Write the step of a branch's joints for the other threads of its world."""
     for j in range(len(values)):
         if j < joints:
             selves.joints[world, hinge_index(model, b, j)] = values[j]
@@ -35,7 +35,7 @@ def write_jacobians(
 ):
     """Write the columns of a branch's joints in the Jacobians of all contacts of its world."""
     for k in range(touching.first, touching.end):
-        geoms = selves.geoms[k]
+        geoms = selves.pair[selves.of_pair[k]]
         first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
         for j in range(len(branch.acc)):
             if j < joints:
@@ -46,20 +46,30 @@ def write_jacobians(
 
 
 @wp.func
-def rows_times_joints(selves: SelfContacts, world: int, k: int) -> vec4:
-    """Return J a of a contact's rows, for the accelerations or the step that all branches have written."""
+def motion_at(selves: SelfContacts, values: wp.array2d(dtype=wp.float32), first: int, world: int, k: int) -> wp.vec3:
+    """Return the motion of a contact's second body less that of its first, for values of all joints from ``first`` on.
+
+    The trunk moves both alike.
+    """
     motion = wp.vec3(0.0)
     for c in range(selves.joints.shape[1]):
-        motion += selves.joints[world, c] * selves.jacobian[k, c]
-    return row_values(selves.found[k], selves.normal[k], motion)
+        motion += values[world, first + c] * selves.jacobian[k, c]
+    return motion
 
 
 @wp.func
-def start_rows(selves: SelfContacts, touching: Touching, world: int, thread: int, threads: int):
-    """Write the residuals of a thread's contacts at the start, and the rows that are expected to push."""
+def start_rows(
+    model: Model, state: State, selves: SelfContacts, touching: Touching, world: int, thread: int, threads: int
+):
+    """Write the rows of a thread's contacts, their residuals at the start, and which of them are expected to push."""
     for k in range(touching.first + thread, touching.end, threads):
-        selves.residual[k] = rows_times_joints(selves, world, k) - selves.found[k].reference
-        selves.pushing[k] = expected_rows(selves.found[k])
+        pair, normal = selves.of_pair[k], selves.normal[k]
+        velocity, acc = motion_at(selves, state.qvel, 6, world, k), motion_at(selves, state.qacc_warmstart, 6, world, k)
+        params, geoms = pair_params(model, selves, world, pair), selves.pair[pair]
+        contact = with_rows(model, world, geoms, params, selves.dist[k], velocity, normal, selves.found[k])
+        selves.found[k] = contact
+        selves.residual[k] = row_values(contact, normal, acc) - contact.reference
+        selves.pushing[k] = expected_rows(contact)
 
 
 @wp.func
@@ -67,7 +77,7 @@ def along_step(selves: SelfContacts, touching: Touching, world: int, thread: int
     """Write the changes of the residuals of a thread's contacts along the step, and return the slope of their cost."""
     slope = float(0.0)
     for k in range(touching.first + thread, touching.end, threads):
-        selves.change[k] = rows_times_joints(selves, world, k)
+        selves.change[k] = row_values(selves.found[k], selves.normal[k], motion_at(selves, selves.joints, 0, world, k))
         pushing = wp.cw_mul(selves.pushing[k], selves.residual[k])
         slope += selves.found[k].mass * wp.dot(pushing, selves.change[k])
     return slope
@@ -78,7 +88,7 @@ def with_coupling(selves: SelfContacts, touching: Touching) -> Touching:
     """Return a world's contacts, marked as coupled if one between two branches pushes."""
     touching.coupled = False
     for k in range(touching.first, touching.end):
-        geoms = selves.geoms[k]
+        geoms = selves.pair[selves.of_pair[k]]
         first, second = selves.geom_place[geoms[0]], selves.geom_place[geoms[1]]
         if first[0] != second[0] and first[1] > 0 and second[1] > 0 and wp.length_sq(selves.pushing[k]) > 0.0:
             touching.coupled = True

@@ -83,7 +83,7 @@ def sense_self_contacts(model: Model, state: State, world: int, selves: SelfCont
     for k in range(touching.first, touching.end):
         force = contact_force(selves.found[k], selves.normal[k], selves.residual[k], selves.pushing[k])
         for side in range(2):
-            address = model.geom_sensor[selves.geoms[k][side]]
+            address = model.geom_sensor[selves.pair[selves.of_pair[k]][side]]
             if address >= 0:
                 sign = wp.where(side == 0, -1.0, 1.0)
                 add_to_sensor(state, world, address, sign * force)

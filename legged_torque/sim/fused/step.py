@@ -59,7 +59,6 @@ def branches_maker(layout: Layout, applied_forces: bool) -> wp.Function:
                 branch.acc[j] = state.qacc_warmstart[world, dof(model.branch_joint[b, j])]
         if wp.static(own.collide):
             write_parts(model, scratch.selves, world, b, poses)
-            constraint_self.write_joints(model, scratch.selves, world, b, joints, branch.acc)
         return branch
 
     @wp.func
@@ -87,7 +86,9 @@ def self_constraint_maker(layout: Layout) -> wp.Function:
     own, find_self_contacts = branches_of(layout), self_contact_finder(layout.self_kinds, layout.threads)
 
     @wp.func
-    def make_self_constraints(model: Model, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch):
+    def make_self_constraints(
+        model: Model, state: State, scratch: own.Scratch, world: int, thread: int, branch: AnyBranch
+    ):
         """Find contacts between parts of the robot and their residuals at the start."""
         touching = Touching()
         if wp.static(own.collide):
@@ -102,7 +103,7 @@ def self_constraint_maker(layout: Layout) -> wp.Function:
                         model, scratch.selves, touching, world, b, own.num_joints(model, b), branch
                     )
             sync_group(wp.static(own.threads))
-            constraint_self.start_rows(scratch.selves, touching, world, thread, wp.static(own.threads))
+            constraint_self.start_rows(model, state, scratch.selves, touching, world, thread, wp.static(own.threads))
             sync_group(wp.static(own.threads))
         return touching
 
@@ -184,7 +185,7 @@ def make_kernel(layout: Layout, applied_forces: bool) -> wp.Kernel:
             trunk = apply_to_trunk(model, state, world, trunk)
         acc = warm_start(state, world)
         branch, total = make_branches(model, state, scratch, world, thread, trunk, acc)
-        touching = make_self_constraints(model, scratch, world, thread, branch)
+        touching = make_self_constraints(model, state, scratch, world, thread, branch)
         whole = whole_body(trunk, total, wp.static(own.threads))
         branch, acc, used = solve(model, scratch, touching, world, thread, whole, branch, trunk.rot, acc)
         integrate(model, state, scratch, touching, world, thread, branch, whole, trunk, acc, sense)
