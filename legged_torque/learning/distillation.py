@@ -27,6 +27,7 @@ from legged_torque.utils.runs import checkpoint_number, find_checkpoint_of
 SAME = ["asset.file", "control.", "init_state.", LAW, "motors.drive.", "motors.muscle.", "normalization.", "sim.dt"]
 SAME += ["terrain.measured_points_"]
 """Beginnings of the paths of settings in which a teacher's run must agree: they say what actions and numbers mean."""
+LEAST_WEIGHT = 0.1  # of actions without effect, as of a PD part that has faded: policies observe their last actions
 DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
 
 
@@ -59,7 +60,9 @@ class Distillation(algorithms.Distillation):
         self._first_rate, self.annealing_start = settings["learning_rate"], settings["annealing_start"]
         self.learning_rate = torch.tensor(self._first_rate, device=device)
         self.optimizer = torch.optim.Adam(student.parameters(), lr=self.learning_rate, fused=True, capturable=True)
-        self.num_mini_batches, self._loss = minibatches, torch.zeros((), device=device)
+        self._skip = torch.zeros((), device=device)  # 1 if the last gradient was not finite
+        self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where it is 1, a fused optimizer skips
+        self.num_mini_batches, self._sums = minibatches, torch.zeros(2, device=device)  # of losses, and of steps made
         worlds = max(env.num_envs // minibatches, 1)
         self._worlds = torch.zeros(worlds, dtype=torch.long, device=device)  # of a gradient step
         self._steps = torch.zeros(length, 1, dtype=torch.long, device=device)
@@ -129,14 +132,14 @@ class Distillation(algorithms.Distillation):
         self.learning_rate.fill_(annealed(iteration, num_iterations, self.annealing_start) * self._first_rate)
 
     def update(self) -> dict[str, float]:
-        """Learn from the rollout, worlds in random order; return the loss "behavior", the learning rate and the noise.
+        """Learn from the rollout, worlds in random order; return the loss "behavior", and what the guard wants to know.
 
-        The loss is the mean over the rollout, in all processes. Each epoch starts from what the student remembered when
-        the rollout began.
+        The loss is the mean over the rollout, in all processes, where actions count by the weights of their torques.
+        Each epoch starts from what the student remembered when the rollout began.
         """
         count, num_steps = len(self._worlds), self.storage.num_transitions_per_env
         windows = torch.arange(num_steps, device=self.device).unsqueeze(1).split(len(self._steps))
-        self._loss.zero_()
+        self._sums.zero_()
         self._memory = self._memory or tuple(part[:, :count].clone() for part in self._at_start)
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(self.storage.num_envs, device=self.device)
@@ -149,24 +152,30 @@ class Distillation(algorithms.Distillation):
                     self.update_graph()
         self.storage.clear()
         if self.is_multi_gpu:
-            distributed.average([self._loss])
-        learned = self.num_learning_epochs * self.num_mini_batches * num_steps
+            distributed.average([self._sums])
+        loss, made = self._sums.tolist()
+        skipped = self.num_learning_epochs * self.num_mini_batches * len(windows) - made
         std = float(self.student.output_std.detach().mean())
-        return {"behavior": self._loss.item() / learned, "learning_rate": self.learning_rate.item(), "action_std": std}
+        numbers = {"behavior": loss / (made * len(self._steps))} if made else {}
+        numbers |= {"learning_rate": self.learning_rate.item(), "action_std": std}
+        return {**numbers, "skipped_updates": skipped, "all_skipped": not made}
 
     def _learn(self) -> None:
         """Take a gradient step on the losses of some steps of some worlds, summed over time, and keep the memory."""
         storage, chosen = self.storage, (self._steps, self._worlds)
         obs = TensorDict({name: values[chosen] for name, values in storage.observations.items()})
         actions, memory = self._replay(obs, 1.0 - storage.dones[chosen].float())
-        loss = len(actions) * self.loss_fn(actions, storage.privileged_actions[chosen])
+        errors = self.loss_fn(actions, storage.privileged_actions[chosen], reduction="none")
+        weights = self._env.control_law.weights().clamp(min=LEAST_WEIGHT)
+        loss = len(actions) * (errors * weights).mean() / weights.mean()
         self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
             distributed.average([value.grad for value in self.student.parameters() if value.grad is not None])
-        nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
+        norm = nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
+        self._skip.copy_(~torch.isfinite(norm))
         self.optimizer.step()
-        self._loss += loss.detach()
+        self._sums += torch.where(self._skip.bool(), 0.0, torch.stack([loss.detach(), 1.0 - self._skip]))
         for own, last in zip(self._memory, memory, strict=True):
             own.copy_(last.detach())
 

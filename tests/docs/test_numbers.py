@@ -349,7 +349,7 @@ def test_self_collision():
     """Times of physics steps without contacts between parts, and with them before and after changes."""
     data = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
     rows = pd.DataFrame(next(each["rows"] for each in data if each["what"].startswith("contacts between parts")))
-    columns = [(False, "ba114ae"), (True, "ba114ae"), (True, "ba114ae and closer search")]
+    columns = [(False, "2cdd058"), (True, "880b83a"), (True, "2cdd058")]
     times = rows.set_index(["worlds", "robots", "self_collision", "commit"])["us"]
     _, said = rows_of("performance.md", "worlds | robots | without")
     assert len(said) == 6
@@ -376,9 +376,9 @@ def test_faults():
 
 
 def test_kernels_of_an_update():
-    """Sums of the kernels' times, and their bounds."""
-    data = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
-    data = next(each for each in data if each["what"].startswith("kernels of a minibatch"))
+    """Sums of the kernels' times, their bounds, and what cuBLAS takes."""
+    measured = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
+    data = next(each for each in measured if each["what"].startswith("kernels of a minibatch"))
     names = {"layers forward": "forward", "losses": "losses", "gradients of what layers read": "input_gradient"}
     names |= {"gradients of weights": "weight_gradient", "observations": "observe"}
     _, rows = rows_of("performance.md", "kernels | before | now | estimate")
@@ -390,3 +390,8 @@ def test_kernels_of_an_update():
             assert same(text, sum(each["us"] for each in kernels)), (name, when)
         bound = data["bound_us"].get(names.get(name))
         assert numbers[2] == (f"{bound:.0f}" if bound else ""), name
+    data = next(each for each in measured if each["what"].startswith("products of a minibatch"))
+    stages = {each["stage"]: each["us"] for each in data["stages"]}
+    hidden = sum(stages[f"forward {i}"] for i in range(3))
+    cublas = 2 * sum(each["us"] for each in data["cublas"][:3])
+    assert f"layers take {hidden:.0f} us forward, in cuBLAS {cublas:.0f}," in text_of("performance.md", "An update is")

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from support.reproducible import differences, values
@@ -24,6 +25,7 @@ from legged_torque.utils.options import Options
 from legged_torque.utils.task_registry import LoadedRun
 
 WORLDS, STEPS, OBS, ACTIONS = 3, 8, 5, 2
+WEIGHTS = [0.0, 1.0]  # of the actions' torques
 SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_steps_per_env=4"]
 SMALL += ["--set=evaluation.interval=16", "--set=evaluation.num_samples=20"]
 OF_TEACHER = ["--task=a1_position", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
@@ -70,7 +72,7 @@ def make_learner(**settings):
     train_cfg = {"distillation": cfg, "num_steps_per_env": STEPS, "obs_groups": {"actor": ["policy"]}}
     train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None, "capture": False}
     env = SimpleNamespace(num_envs=WORLDS, num_actions=ACTIONS, device="cpu", get_observations=observations)
-    env.terrain = None
+    env.terrain, env.control_law = None, SimpleNamespace(weights=lambda: torch.tensor(WEIGHTS))
     alg = Distillation.construct_algorithm(observations(), env, train_cfg, "cpu")
     alg.teacher = Wise()
     return alg
@@ -88,6 +90,12 @@ def roll_out(alg):
     return seen, ends
 
 
+def weighted(errors):
+    """The mean square of errors of actions by their weights; those without effect count a tenth."""
+    weights = np.maximum(WEIGHTS, 0.1)
+    return (errors.square().mean(dim=0) * torch.from_numpy(weights).float()).sum() / weights.sum()
+
+
 def by_hand(student, seen, ends, hidden):
     """The loss of a rollout with torch's GRU cell, whose state is 0 after the end of an episode."""
     cell = nn.GRUCell(OBS, 4)
@@ -95,7 +103,7 @@ def by_hand(student, seen, ends, hidden):
     loss = 0.0
     for obs, dones in zip(seen, ends, strict=True):
         hidden = torch.func.functional_call(cell, of_layer, (obs["policy"], hidden))
-        loss = loss + (student.mlp(hidden) - obs["more"]).square().mean()
+        loss = loss + weighted(student.mlp(hidden) - obs["more"])
         hidden = hidden * ~dones.unsqueeze(1)
     return loss, hidden
 
@@ -116,6 +124,24 @@ def test_gradients_go_back_in_time():
             torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
 
 
+def test_steps_without_finite_gradients_are_skipped():
+    """They change no weight and are counted, and the loss is that of the others."""
+    torch.manual_seed(0)
+    alg = make_learner(gradient_length=STEPS // 2)
+    seen, ends = roll_out(alg)
+    loss, _ = by_hand(alg.student, seen[: STEPS // 2], ends[: STEPS // 2], torch.zeros(WORLDS, 4))
+    alg.storage.privileged_actions[STEPS // 2 :] = torch.nan
+    numbers = alg.update()
+    assert (numbers["skipped_updates"], numbers["all_skipped"]) == (1, False)
+    assert numbers["behavior"] == pytest.approx(float(loss.detach()) / (STEPS // 2), rel=1e-5)
+    before = copy.deepcopy(alg.student.state_dict())
+    roll_out(alg)
+    alg.storage.privileged_actions[:] = torch.nan
+    numbers = alg.update()
+    assert (numbers["skipped_updates"], numbers["all_skipped"]) == (2, True) and "behavior" not in numbers
+    assert all(torch.equal(value, before[name]) for name, value in alg.student.state_dict().items())
+
+
 @pytest.mark.parametrize(("rnn_type", "layers"), [("gru", 1), ("gru", 2), ("lstm", 2), ("none", 1)])
 def test_memory_goes_on_from_one_gradient_step_to_the_next(rnn_type, layers):
     """Without learning, the loss of parts of the worlds and of the rollout is that of a student which acts in all."""
@@ -128,7 +154,7 @@ def test_memory_goes_on_from_one_gradient_step_to_the_next(rnn_type, layers):
         losses = []
         for obs, dones in zip(*roll_out(alg), strict=True):
             with torch.no_grad():
-                losses.append((twin(obs) - obs["more"]).square().mean())
+                losses.append(weighted(twin(obs) - obs["more"]))
             twin.reset(dones)
         assert alg.update()["behavior"] == pytest.approx(float(sum(losses)) / STEPS, rel=1e-5)
 

@@ -97,6 +97,12 @@ class ControlLaw:
         """Return the mirror images of the actions by term, given that of joint angles; None where it is not known."""
         return [(term.name, joints.unsigned() if joints and term.is_unsigned else joints) for term in self.terms]
 
+    def weights(self) -> Tensor:
+        """Return the weight of each action's torques now, on the device. Shape: (num_actions,)."""
+        size = self.num_actions // len(self.terms)
+        weights = [term.scale.new_ones(()) if term.weight is None else term.weight for term in self.terms]
+        return torch.stack(weights).repeat_interleave(size)
+
     def torques(self, actions: Tensor, pos: Tensor, vel: Tensor, out: Tensor) -> Tensor:
         """Write the torques that motors are asked for to ``out`` [N m], and return it.
 

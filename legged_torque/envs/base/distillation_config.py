@@ -31,5 +31,5 @@ class DistillationCfg(Section):
 
 def preset() -> dict[str, dict[str, Any]]:
     """Return the changes that choose a student."""
-    runner = {"num_steps_per_env": 24, "total_steps": 60_000_000}
+    runner = {"num_steps_per_env": 24, "total_steps": 120_000_000}
     return {"runner": runner, "algorithm": {"class_name": DISTILLATION}}

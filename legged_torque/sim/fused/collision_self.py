@@ -57,7 +57,7 @@ class SelfContacts:
     geom_place: wp.array(dtype=wp.vec2i)  # of each geom: branch, and depth of its body; 0 is the trunk
     airborne: wp.array(dtype=wp.int32)  # addresses of the sensors of those geoms that the ground lets through
     # Scratch; worlds are last where threads read and write neighbours:
-    place: wp.array3d(dtype=wp.float32)  # (geom, 10, world): position from the trunk's origin, see REACH, X_AXIS, Z_AXIS
+    place: wp.array3d(dtype=wp.float32)  # (geom, 10, world): position from the trunk's origin, see REACH and the axes
     near: wp.array2d(dtype=wp.int32)  # (place, world): the pairs that may touch, those of each thread in order
     found: wp.array(dtype=Contact)  # MAX_SELF_CONTACTS for each world; the next three as in PlaneContacts
     residual: wp.array(dtype=vec4)

@@ -12,7 +12,7 @@ from legged_torque.sim.fused.constraint import contact_force, contact_stiffness,
 from legged_torque.sim.fused.math import column, group_sum, group_sum3, inverse_sqrt, sync_group, with_column
 from legged_torque.sim.fused.model import Model, State
 from legged_torque.sim.fused.trunk import TrunkMotion, TrunkSystem, WholeBody, trunk_matrix
-from legged_torque.sim.fused.types import AnyBranch, AnyVector, vec4
+from legged_torque.sim.fused.types import AnyBranch, AnyVector
 
 
 @wp.func
