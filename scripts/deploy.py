@@ -90,12 +90,13 @@ def main() -> None:
         log = Log(args.log, controller, keeps_time=args.interface != "sim")
     session = Session(controller, transport, log)
     loop = RealTimeLoop(args.rate, session.tick)
-    chirps = [policy] if args.chirp else []
     view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
     ended, aside = threading.Event(), ThreadPoolExecutor()
 
     def tell() -> None:
         """Write the log and draw the view, in a thread of its own: a disk or a terminal may keep that waiting."""
+        with contextlib.suppress(OSError, AttributeError):  # as other programs, after the loop
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         while not ended.wait(POLL):
             if log:
                 log.write()
@@ -109,7 +110,7 @@ def main() -> None:
         while not (stop.requested or time.monotonic() > end or loop.error or telling.done()):
             for operator in operators:
                 operator.look()
-            if any(each.has_ended for each in (*operators, *chirps)):
+            if any(each.has_ended for each in (*operators, *([policy] if args.chirp else []))):
                 break
             time.sleep(POLL)
     telling.result()
@@ -166,9 +167,8 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
     from legged_torque.runtime.dds import Go2Robot
 
     if trained != ROBOT:
-        raise UserError(
-            f"the policy is of the robot '{trained}'; DDS leads to a '{ROBOT}', --interface sdk to A1 and Go1"
-        )
+        others = f"DDS leads to a '{ROBOT}', --interface sdk to A1 and Go1"
+        raise UserError(f"the policy is of the robot '{trained}'; {others}")
     return Go2Robot(args.interface, args.domain or 0)
 
 

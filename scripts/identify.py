@@ -1,10 +1,10 @@
 """Identify the drives of a robot that hangs in the air, from a log of deploy.py --chirp.
 
 Examples:
-    python scripts/identify.py chirp.mcap                       # prints a table, writes chirp.yaml
+    python scripts/identify.py chirp.mcap                       # prints a table, writes chirp_motors.yaml
 
-Minutes on a CPU. Train with what it found: train.py --motors chirp.yaml. docs/howto/identify.md says how to make such a
-log, and what the numbers are worth.
+Minutes on a CPU. Train with what it found: train.py --motors chirp_motors.yaml. docs/howto/identify.md says how to make
+such a log, and what the numbers are worth.
 """
 
 import argparse
@@ -25,13 +25,13 @@ def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
     parser = cli.Parser(__doc__)
     parser.add_argument("log", type=Path, help="MCAP file of deploy.py --log")
-    parser.add_argument("--out", type=Path, help="YAML file for --motors; default: the log's name with .yaml")
+    parser.add_argument("--out", type=Path, help="YAML file for --motors; default: the log's name with _motors.yaml")
     parser.add_argument("--json", type=Path, help="JSON file of all numbers, intervals and errors to write")
     cli.add_options(parser, "device", "task_file")
     args = parser.parse_args()
     if not args.log.is_file():
         raise UserError(f"cannot read '{args.log}': there is no such file")
-    args.out = args.out or args.log.with_suffix(".yaml")
+    args.out = args.out or args.log.with_name(f"{args.log.stem}_motors.yaml")
     for file in filter(None, (args.out, args.json)):
         cli.check_output(file)
     return args
@@ -78,9 +78,8 @@ def settings_text(names: list[str], values: dict[str, Any], step: float, fields:
         delay = {"unit": "milliseconds", "range": [round(1e3 * step) * steps] * 2}
     joints = {}
     for key, field in fields.items():
-        joints[field.removeprefix("dof_")] = {
-            name: float(f"{value:.4g}") for name, value in zip(names, values[key], strict=True)
-        }
+        rounded = (float(f"{value:.4g}") for value in values[key])
+        joints[field.removeprefix("dof_")] = dict(zip(names, rounded, strict=True))
     drawn = {"keep_fixed": list(fields.values()), "joint_offset": {"add": [-offset, offset]}}
     content = {"motors": {"joints": joints, "delay": delay}, "domain_rand": drawn}
     return yaml.dump(content, Dumper=Dumper, sort_keys=False)

@@ -36,22 +36,19 @@ library_name: legged_torque
 pipeline_tag: reinforcement-learning
 tags: [robotics, locomotion, torque-control, mujoco]
 {license_line}---
-# {policy}
+# {policy:s}
 
-A policy of legged_torque's task `{task}` after {steps:,} steps of training. `policy.yaml` says how to run
+A policy of legged_torque's task `{task:s}` after {steps:,} steps of training. `policy.yaml` says how to run
 `policy.onnx`; `index.html` does so in the browser, on a plane, from any server of files: `python -m http.server`.
 
-| {names} |
-|{lines}|
-{rows}
+| evaluation | tracking | falls per minute | cost of transport |
+|---|---|---|---|
+| {rows} |
 
 Means and standard errors over worlds. `card.yaml` has all of them, and how they were measured.
 """
-SHOWN = {
-    "track_percentage": "tracking",
-    "falls_per_minute": "falls per minute",
-    "cost_of_transport": "cost of transport",
-}
+SHOWN = ("track_percentage", "falls_per_minute", "cost_of_transport")  # the columns of README
+NEEDED = ("policy", "task", "steps")  # of a card, in README
 
 
 def parse_args() -> argparse.Namespace:
@@ -94,6 +91,7 @@ def main() -> None:
         part.mkdir(parents=True)
         try:
             card = copy_policy(network, part, policy.description)
+            write_cards(part, {"metrics": {}} | card)  # what a card lacks is told before minutes of evaluation
             for note in write_page(part, policy, card["policy"]):
                 print(printable(f"  note: {note}"))
             metrics = evaluate(simulation, 1 if "metrics" in card else ROBOTS, STEPS, 1, on_step)
@@ -142,13 +140,16 @@ def portable_settings(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_cards(folder: Path, card: dict[str, Any]) -> None:
-    """Write the card with the files' checksums, and README.md, which the Hub shows."""
-    kinds = card["metrics"].items()
-    names = " | ".join(["evaluation", *SHOWN.values()])
-    rows = [" | ".join([kind, *("{:.3f} +- {:.3f}".format(*each[name]) for name in SHOWN)]) for kind, each in kinds]
-    table = {"names": names, "lines": "---|" * len(SHOWN) + "---", "rows": "\n".join(f"| {row} |" for row in rows)}
-    table["license_line"] = f"license: {card['license'].lower()}\n" if "license" in card else ""
-    write_whole(folder / "README.md", README.format(**card, **table))
+    """Write the card with the files' checksums, and README.md, which the Hub shows; a UserError if that lacks parts."""
+    try:
+        kinds = card["metrics"].items()
+        rows = [" | ".join([kind, *("{:.3f} +- {:.3f}".format(*each[name]) for name in SHOWN)]) for kind, each in kinds]
+        line = f"license: {card['license'].lower()}\n" if "license" in card else ""
+        text = README.format(license_line=line, rows=" |\n| ".join(rows), **{name: card[name] for name in NEEDED})
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        needed = f"{', '.join(NEEDED)}, and in metrics two numbers each of {', '.join(SHOWN)}"
+        raise UserError(f"{CARD} must have {needed} ({type(error).__name__}: {error})") from None
+    write_whole(folder / "README.md", text)
     described = (NETWORK_FILE, DESCRIPTION_FILE, CONFIG_FILE, *(file.name for file in folder.glob("model_*.pt")))
     card["files"] = {name: sha256(folder / name) for name in sorted(described) if (folder / name).is_file()}
     write_whole(folder / CARD, yaml.dump(card, Dumper=Dumper, sort_keys=False, width=100))

@@ -44,14 +44,14 @@ def read_recording(log: Any) -> Recording:
     if len(ticks) * log.period < SHORTEST:
         raise UserError(f"the log has {len(ticks) * log.period:.1f} s of a policy or chirp; {SHORTEST:g} s are needed")
     times, states, sent, _ = zip(*ticks, strict=True)
+    times = times if log.keeps_time else log.period * np.arange(len(ticks))  # such a robot waits for late ticks
     if states[0] is None:
         raise UserError("the log has no state of the robot where the motion begins")
     count = round((times[-1] - times[0]) / log.period) + 1
     rows = np.searchsorted(times, times[0] + log.period * (0.5 + np.arange(count))) - 1
-    is_new = np.diff(rows, prepend=-1) > 0
     nothing = np.full((2, len(log.joint_order)), np.nan)
     said = [nothing if state is None else (state.joint_positions, state.joint_velocities) for state in states]
-    measured = np.where(is_new[:, None, None], np.array(said)[rows], np.nan)
+    measured = np.where(np.diff(rows, prepend=-1)[:, None, None], np.array(said)[rows], np.nan)
     commands = np.array([[getattr(command, name) for name in COMMAND] for command in sent])[rows]
     quaternion = held([state.quaternion for state in states if state is not None])
     return Recording(log.joint_order, log.period, quaternion, commands, measured)

@@ -21,6 +21,8 @@ class Brakes:
     max_damaged: int = 3  # messages with a wrong checksum since the last whole one
     max_missed: float = 0.014  # seconds of one late tick, as when the program is halted
     max_slow: float = 0.008  # seconds in which every deadline of several ticks was missed
+    max_behind: float = 0.02  # seconds that late ticks have cost in all, of which some is forgiven
+    max_pose_error: float = 0.5  # of a joint from the nominal pose when a policy takes over [rad]
     torque_rate: float = 2000.0  # most by which a torque changes [N m/s]
     ramp: float = 0.5  # seconds in which a policy takes over from standing
     stand_up: float = 3.0  # seconds from any pose to the nominal one

@@ -12,6 +12,7 @@ from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, 
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
 MOST_COMMANDS = 500.0  # a second, unless more are asked for
+FORGIVEN = 0.4  # time constant with which the time that late ticks have cost is forgiven [s]; 95% of the rate will do
 
 
 def default_rate(of_policy: float) -> float:
@@ -58,7 +59,7 @@ class Controller:
         self.mode, self.reason = Mode.DAMPING, ""
         self.state: RobotState | None = None
         self.velocity_command = np.zeros(3)
-        self._since, self._state_time, self._now, self._on_time = 0.0, -np.inf, 0.0, 0.0
+        self._since, self._state_time, self._now, self._on_time, self._behind = 0.0, -np.inf, 0.0, 0.0, 0.0
         self._damaged = self._missed = 0  # messages, and deadlines in a row
         self._problems: list[str] = []  # of the last look
         self._actions, self._tick, self._from = np.zeros(0, np.float32), 0, self._nominal_pose
@@ -96,16 +97,22 @@ class Controller:
         Damping and passivity are never refused. After a fault the robot must stand before it walks.
         """
         with self._lock:
-            stands = self.mode == Mode.STAND and self._now - self._since >= self.brakes.stand_up
-            if mode == Mode.POLICY and not stands:
-                return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
-            if mode == Mode.STAND and (problem := self._fault()):
+            checks = {Mode.STAND: self._fault, Mode.POLICY: self._not_standing}
+            if mode in checks and (problem := checks[mode]()):
                 return problem
             self._enter(mode)
             self.reason = ""
             if mode in (Mode.PASSIVE, Mode.DAMPING):
                 self.sent = self._at_rest()  # the command of this tick may not have been sent yet
         return ""
+
+    def _not_standing(self) -> str:
+        """Return why a policy must not take over."""
+        if self.state is None or self.mode != Mode.STAND or self._now - self._since < self.brakes.stand_up:
+            return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
+        off, allowed = np.abs(self.state.joint_positions - self._nominal_pose), self.brakes.max_pose_error
+        worst = f"{self.joints.names[off.argmax()]} is {off.max():.2f} rad from the nominal pose"
+        return f"{worst}, at most {allowed:g} are allowed" if off.max() > allowed else ""
 
     def stop(self, reason: str) -> None:
         """End in damping for a reason."""
@@ -115,7 +122,7 @@ class Controller:
 
     def _enter(self, mode: Mode) -> None:
         """Begin with a mode."""
-        self.mode, self._since, self._tick = mode, self._now, 0
+        self.mode, self._since, self._tick, self._behind = mode, self._now, 0, 0.0
         if self.state is not None:
             self._from = self.state.joint_positions.copy()
         if mode == Mode.POLICY:
@@ -145,6 +152,8 @@ class Controller:
 
     def _step(self, received: Received, now: float, missed: bool) -> MotorCommand:
         """Do what :meth:`step` says, if all goes well."""
+        moves, late = self.mode in (Mode.STAND, Mode.POLICY), now - self._now - self.period
+        self._behind = max(0.0, (1.0 - self.period / FORGIVEN) * self._behind + late) if moves else 0.0
         self._now, self._on_time = now, self._on_time if missed else now
         self._missed = self._missed + 1 if missed else 0
         if isinstance(received.newest, RobotState):
@@ -180,7 +189,10 @@ class Controller:
     def _lateness(self, now: float, missed: int) -> str:
         """Return why it is too late for a command at a time [s], after so many missed deadlines in a row."""
         late, allowed = now - self._on_time, self.brakes.max_slow if missed > 1 else self.brakes.max_missed
-        return f"all deadlines of {1e3 * late:.0f} ms were missed" if late > allowed + 1e-6 else ""
+        if late > allowed + 1e-6:
+            return f"all deadlines of {1e3 * late:.0f} ms were missed"
+        lost, allowed = 1e3 * self._behind, 1e3 * self.brakes.max_behind
+        return f"late ticks have cost {lost:.1f} ms, at most {allowed:.0f} are allowed" if lost > allowed else ""
 
     def _at_rest(self) -> MotorCommand:
         """Return the command of a robot that neither stands nor walks."""

@@ -114,9 +114,8 @@ def write_leapp(folder: Path) -> None:
             wanted.append(("joint_torques", weight * scaled, Wanted.JOINT_TORQUES))
         else:
             wanted.append(("joint_pos_target", pose + scaled, Wanted.JOINT_POSITION))
-            constant = [
-                (kind.value, weight * gain, kind) for kind, gain in zip((Wanted.KP, Wanted.KD), gains, strict=True)
-            ]
+            by_kind = zip((Wanted.KP, Wanted.KD), gains, strict=True)
+            constant = [(kind.value, weight * gain, kind) for kind, gain in by_kind]
     outputs, constants = ([TensorSemantics(*each, joints) for each in part] for part in (wanted, constant))
     annotate.output_tensors("policy", outputs, static_outputs=constants or None, export_with="onnx-torchscript")
     stop()

@@ -11,6 +11,7 @@ from legged_torque.utils.errors import UserError, check_names
 KINDS = {"a1": "A1", "go1": "Go1"}  # names of the SDK
 LOW_LEVEL, LOCAL_PORT, ROBOT = 0xFF, 8080, ("192.168.123.10", 8007)
 SERVO, OVERHEATED = 0x0A, 0x08  # modes of a motor
+AT_ONCE = 32  # messages of a look, at most
 
 
 class LeggedSdkRobot:
@@ -34,13 +35,17 @@ class LeggedSdkRobot:
         self._udp.InitCmdData(self._command)
 
     def receive(self) -> Received:
-        """Return the newest state, if there is one whose ``tick`` is new."""
-        self._udp.Recv()
-        self._udp.GetRecv(self._state)
-        if self._state.tick == self._tick:
+        """Return the newest state, if there is one whose ``tick`` is new: the SDK hands out one after the other."""
+        before = self._tick
+        for _ in range(AT_ONCE):
+            self._udp.Recv()
+            self._udp.GetRecv(self._state)
+            if self._state.tick == self._tick:
+                break
+            self._tick = self._state.tick
+        if self._tick == before:
             return Received()
-        self._tick, imu = self._state.tick, self._state.imu
-        motors = self._state.motorState[: len(JOINT_ORDER)]
+        imu, motors = self._state.imu, self._state.motorState[: len(JOINT_ORDER)]
         rows = [(each.q, each.dq, each.tauEst, each.temperature, each.mode == OVERHEATED) for each in motors]
         q, dq, torques, temperatures, errors = np.array(rows, float).T
         trunk = np.array(imu.quaternion), np.array(imu.gyroscope)

@@ -68,8 +68,8 @@ class Log:
         state = received.newest if isinstance(received.newest, RobotState) else None
         tick: dict[str, Any] = {"mode": controller.mode.value, "reason": controller.reason, "missed": missed}
         tick |= {"damaged": received.wrong_crc, "lost": received.lost, "late": received.late}
-        tick |= {"velocity_command": controller.velocity_command.copy()}
-        self._waiting.append((TICK, now, tick | {"state": state, "command": command}))
+        tick |= {"velocity_command": controller.velocity_command.copy(), "state": state, "command": command}
+        self._waiting.append((TICK, now, tick))
         if step is not None:
             self._waiting.append((POLICY, now, vars(step)))
 

@@ -49,21 +49,22 @@ class Release:
 
     def begin(self) -> None:
         """Ask anew, as a robot may have been switched on again."""
-        self.problem, self._number, self._next, self._absent_at = "the motion switcher does not answer", 0, 0.0, np.inf
-        self.mode = ""
+        self.problem, self.mode = "the motion switcher does not answer", ""
+        first, self._released, self._next, self._absent_at = time.monotonic_ns(), 0, 0.0, np.inf
+        self._asked = range(first, first)  # numbers of all requests
 
     def look(self, responses: list[Any], now: float) -> None:
         """Take answers, and ask for what is missing, at a time [s]. An answer that cannot be read is a mode."""
-        if not self._number and self._is_optional:
+        if not self._asked and self._is_optional:
             self._absent_at = now + ABSENT
         for response in responses:
             identity, code = response.header.identity, response.header.status.code
-            if identity.id != self._number:
+            if identity.id not in self._asked:
                 continue
             self._absent_at = np.inf
             if code:
                 self.problem = f"the motion switcher answers with error {code}"
-            elif identity.api_id == CHECK_MODE:
+            elif identity.api_id == CHECK_MODE and identity.id > self._released:  # else it tells of before
                 try:
                     self.mode = json.loads(response.data)["name"]
                 except (ValueError, KeyError, TypeError):
@@ -78,8 +79,10 @@ class Release:
 
     def _ask(self, api: int, now: float) -> None:
         """Send a request."""
-        self._number, self._next = time.monotonic_ns(), now + AGAIN
-        self._write(Request_(RequestHeader_(Identity_(self._number, api), Lease_(0), Policy_(0, False)), "{}", []))
+        number, self._next = self._asked.stop, now + AGAIN
+        self._asked = range(self._asked.start, number + 1)
+        self._released = number if api == RELEASE_MODE else self._released
+        self._write(Request_(RequestHeader_(Identity_(number, api), Lease_(0), Policy_(0, False)), "{}", []))
 
 
 class SportMode:

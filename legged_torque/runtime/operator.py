@@ -141,8 +141,10 @@ class Datagrams(Operator):
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         try:
+            if not 1 <= int(port) <= 65535:
+                raise ValueError("ports are from 1 to 65535")
             self._socket.bind((host or "127.0.0.1", int(port)))
-        except (OSError, OverflowError, ValueError) as error:
+        except (OSError, ValueError) as error:
             raise UserError(f"--udp is a free PORT or ADDRESS:PORT of this machine, not {address} ({error})") from None
 
     def __exit__(self, *exception: object) -> None:

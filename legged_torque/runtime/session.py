@@ -23,11 +23,7 @@ class Session:
     """
 
     def __init__(
-        self,
-        controller: Controller,
-        transport: Transport,
-        log: Any = None,
-        clock: Callable[[], float] = time.monotonic,
+        self, controller: Controller, transport: Transport, log: Any = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Prepare; nothing is sent yet. ``log``, a :class:`~legged_torque.runtime.log.Log`, gets every tick.
 

@@ -117,42 +117,18 @@ _BATTERY = dict.fromkeys(("version_high", "version_low", "status", "soc"), uint8
 BmsState_ = _type("BmsState_", **_BATTERY, bq_ntc=(uint8, 2), mcu_ntc=(uint8, 2), cell_vol=(uint16, 15))
 _START = {"head": (uint8, 2), "level_flag": uint8, "frame_reserve": uint8}
 _START |= {"sn": (uint32, 2), "version": (uint32, 2), "bandwidth": uint16}
-LowCmd_: type[Message] = _type(
-    "LowCmd_",
-    **_START,
-    motor_cmd=(MotorCmd_, SLOTS),
-    bms_cmd=BmsCmd_,
-    wireless_remote=(uint8, 40),
-    led=(uint8, 12),
-    fan=(uint8, 2),
-    gpio=uint8,
-    reserve=uint32,
-    crc=uint32,
-)
+_OF_COMMANDS = {"motor_cmd": (MotorCmd_, SLOTS), "bms_cmd": BmsCmd_, "wireless_remote": (uint8, 40), "led": (uint8, 12)}
+_OF_COMMANDS |= {"fan": (uint8, 2), "gpio": uint8, "reserve": uint32, "crc": uint32}
+LowCmd_: type[Message] = _type("LowCmd_", **_START, **_OF_COMMANDS)
 """Command of a robot, on the topic rt/lowcmd.
 
 Unitree's programs leave ``reserve`` 0; ours number their messages there, from 1.
 """
-LowState_: type[Message] = _type(
-    "LowState_",
-    **_START,
-    imu_state=IMUState_,
-    motor_state=(MotorState_, SLOTS),
-    bms_state=BmsState_,
-    foot_force=(int16, 4),
-    foot_force_est=(int16, 4),
-    tick=uint32,
-    wireless_remote=(uint8, 40),
-    bit_flag=uint8,
-    adc_reel=float32,
-    temperature_ntc1=uint8,
-    temperature_ntc2=uint8,
-    power_v=float32,
-    power_a=float32,
-    fan_frequency=(uint16, 4),
-    reserve=uint32,
-    crc=uint32,
-)
+_OF_STATES = {"imu_state": IMUState_, "motor_state": (MotorState_, SLOTS), "bms_state": BmsState_}
+_OF_STATES |= {"foot_force": (int16, 4), "foot_force_est": (int16, 4), "tick": uint32, "wireless_remote": (uint8, 40)}
+_OF_STATES |= {"bit_flag": uint8, "adc_reel": float32, "temperature_ntc1": uint8, "temperature_ntc2": uint8}
+_OF_STATES |= {"power_v": float32, "power_a": float32, "fan_frequency": (uint16, 4), "reserve": uint32, "crc": uint32}
+LowState_: type[Message] = _type("LowState_", **_START, **_OF_STATES)
 """State of a robot, on the topic rt/lowstate."""
 
 _CDR = b"\0\1\0\0"
@@ -249,6 +225,7 @@ def encode_state(state: RobotState) -> Message:
     message["imu_state.gyroscope"] = _finite("angular_velocity", state.angular_velocity, 3).tolist()
     columns = {member: _finite(name, getattr(state, name)) for name, member in MEASURED.items()}
     columns["temperature"] = np.clip(np.rint(columns["temperature"]), 0, 255).astype(np.uint8)
+    _finite("errors", state.errors)
     columns["reserve"] = np.asarray(state.errors, np.uint32)
     for member, column in columns.items():
         message[f"motor_state.{member}"] = column.tolist()

@@ -1,8 +1,10 @@
 """Identification of a leg: known numbers are found, with intervals; what a log does not tell is refused by name."""
 
+import copy
 import json
 import re
 import runpy
+import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 import pytest
@@ -21,15 +23,29 @@ from legged_torque.utils.options import Options
 
 
 def test_the_trunk_is_fixed(leg):
-    """Worlds are where a robot on a fixed, tilted trunk is in plain MuJoCo, in any order of the joints."""
+    """Worlds are where a robot on a fixed, tilted trunk is in plain MuJoCo, in any order of the joints.
+
+    Nothing collides, not even a <pair> of neighbours.
+    """
+    touching, tree = copy.deepcopy(leg), ElementTree.parse(leg.asset.file)
+    ElementTree.SubElement(ElementTree.SubElement(tree.getroot(), "contact"), "pair", geom1="FR_thigh", geom2="FR_calf")
+    touching.asset.file, touching.asset.self_collisions = leg.asset.file.replace("leg.xml", "pair.xml"), True
+    tree.write(touching.asset.file)
     known, order = record(leg, sweep(1.5), step=1e-3, half=0.5), [2, 0, 1]
     shuffled = [known.joint_order[place] for place in order]
     recording = Recording(shuffled, known.period, TILT, known.commands[..., order], known.measured[..., order])
-    robots = HangingRobots(leg, recording, "cpu")
+    robots = HangingRobots(touching, recording, "cpu")
     assert robots.branches == [[1, 2, 0]]
     seen = robots.run(np.tile(TRUTH[:, order], (robots.num_worlds, 1, 1)), len(known.commands)).numpy()
     np.testing.assert_allclose(seen[:, 5], known.measured[..., order], atol=3e-5)
     np.testing.assert_array_equal(seen[:, 0], seen[:, -1])
+
+
+def test_joints_that_a_log_lacks(leg):
+    """One that would hang limp on the branch of others is refused by name."""
+    known = record(leg, sweep(0.1), step=1e-3)
+    part = Recording(known.joint_order[:2], known.period, TILT, known.commands[..., :2], known.measured[..., :2])
+    assert error_of(HangingRobots, leg, part, "cpu").endswith("branches that it has: FR_calf_joint")
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +59,7 @@ def found(leg, tmp_path_factory):
         words = ("chirp.mcap", "--json", "found.json", "--device", "cpu")
         status, output, error = run_here("identify.py", *words, root=folder)
         assert status == 0, error
-        cfg = task_registry.get_cfgs("one_leg", Options(device="cpu", motors=str(folder / "chirp.yaml")))[0]
+        cfg = task_registry.get_cfgs("one_leg", Options(device="cpu", motors=str(folder / "chirp_motors.yaml")))[0]
     content = json.loads((folder / "found.json").read_text())
     return {name: np.array(value) for name, value in content.items()}, output, cfg
 

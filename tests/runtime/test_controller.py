@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from subprocess import PIPE
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -152,12 +153,18 @@ def test_from_lying_to_walking_and_back(policy):
     joints, trunk = world.robot.data.qpos[7:], world.robot.data.qpos[2]
     nominal = [policy.description["nominal_pose"][name] for name in policy.joint_order]
     order = [world.robot.model.joint(i).name for i in range(1, 13)]
-    assert np.abs(joints - [nominal[policy.joint_order.index(name)] for name in order]).max() < 0.2
+    nominal = np.array([nominal[policy.joint_order.index(name)] for name in order])
+    assert np.abs(joints - nominal).max() < 0.2
     assert trunk > 0.25 and world.robot.excess <= 1e-6
     assert world.controller.request(Mode.POLICY) == "" and world.run(25) == Mode.POLICY
     assert world.controller.request(Mode.DAMPING) == ""
     assert world.run(round(3 * RATE)) == Mode.DAMPING and world.robot.data.qpos[2] < 0.2
     assert not world.controller.sent.kp.any() and not world.controller.sent.tau.any()
+    world.robot.faults.dead, world.controller.brakes.stand_up = order, 0.01  # time passes, and nothing moves
+    assert world.controller.request(Mode.STAND) == "" and world.run(10) == Mode.STAND
+    worst = np.abs(joints - nominal).argmax()
+    refused = f"{order[worst]} is {abs(joints - nominal)[worst]:.2f} rad from the nominal pose, at most 0.5 are allowed"
+    assert world.controller.request(Mode.POLICY) == refused
 
 
 def test_the_wrong_robot(policy):
@@ -298,6 +305,36 @@ def test_a_halt_between_two_ticks_is_noticed():
         ticks = np.array([line.split() for line in program.communicate("\n")[0].splitlines()], float)
     longest = np.diff(ticks[:, 0]).argmax()
     assert ticks[longest + 1, 0] - ticks[longest, 0] > 0.4 and ticks[longest + 1, 1] and not ticks[0, 1]
+
+
+def paced(world, durations):
+    """Seconds until the robot is stopped, in a loop with absolute deadlines whose ticks take so long [s], or None."""
+    begin = due = start = world.now + 1 / RATE
+    for world.took in durations:
+        world.tick(begin, missed := begin - due > 0.5 / RATE)
+        if world.stops:
+            return begin - start
+        due = (begin if missed else due) + 1 / RATE
+        begin = max(begin + world.took, due)
+    return None
+
+
+def test_a_program_that_is_late_again_and_again(policy):
+    """It is stopped though half or most of its ticks are in time; one on a machine that is busy now and then is not."""
+    busy = np.random.default_rng(0).uniform(3e-4, 0.0019, 4000)
+    busy[::500], busy[1000::1500] = 0.0026, 0.01  # 0.6 and 8 ms late
+    for durations, most in (
+        (np.tile([0.011, 5e-4], 100), 0.05),
+        (np.full(1000, 0.00227), 0.5),  # 88% of the rate
+        (np.tile([*[0.00295] * 2, *[0.0015] * 8], 100), 0.5),
+        (busy, None),
+        (np.array([0.0135, *[5e-4] * 300] * 3), None),
+    ):
+        world, kept = standing_at_once(policy), Received(standing_at_once(policy).controller.state)
+        assert world.controller.request(Mode.STAND) == ""
+        world._transport = SimpleNamespace(receive=lambda kept=kept: kept, send=lambda command: None)
+        ended = paced(world, durations)
+        assert ended is most or (0.02 < ended < most and "late ticks have cost 2" in world.stops[0]), world.stops
 
 
 def test_missed_deadlines_and_a_dead_program(policy):

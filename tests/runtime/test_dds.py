@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections import deque
 from contextlib import contextmanager
 
 import numpy as np
@@ -235,6 +236,22 @@ def test_answers_of_the_motion_switcher():
             assert bool(release.problem) == (now < 7.0 or not is_optional)
     number = sent[0].header.identity.id  # two of 64 bits, one for the lease, priority, a flag; text; an empty sequence
     assert sent[0].serialize()[4:] == struct.pack("<qqqi?3xI3sxI", number, 1001, 0, 0, False, 3, b"{}", 0)
+
+
+@pytest.mark.parametrize("late", [0.5, 1.9])
+def test_slow_answers_of_the_motion_switcher(late):
+    """A service that takes so long [s] is not taken for none, and releases its mode once."""
+    service, sent, coming, now = SportMode(), [], deque(), 0.0
+
+    def answer(request):
+        sent.append(request.header.identity.api_id)
+        coming.append((now + late, service.answer(request)))
+
+    release = Release(answer, is_optional=True)
+    for now in np.arange(0.0, 3 * late, 0.01):
+        release.look([coming.popleft()[1] for due, _ in [*coming] if due <= now] if release.problem else [], now)
+        assert release.problem or not service.name
+    assert not release.problem and sent.count(1003) == 1
 
 
 def test_robots_that_start_anew_and_two_at_once(transport):

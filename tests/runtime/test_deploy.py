@@ -23,6 +23,7 @@ from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import RecordedLog
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.runtime.view import View
 
 RATE, DOMAIN, OTHER = 500.0, 200 + os.getpid() % 16, 216 + os.getpid() % 16
 SIDE = """
@@ -113,6 +114,14 @@ def test_ctrl_c_in_the_farewell(exported, tmp_path, monkeypatch):
     assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[::2] == (0, "")
 
 
+def test_only_the_loop_goes_before_other_programs(exported, tmp_path, monkeypatch):
+    """What draws the view and writes the log does not; where real-time scheduling is not permitted, nothing does."""
+    seen = set()
+    monkeypatch.setattr(View, "show", lambda self: seen.add(os.sched_getscheduler(0)))
+    assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[0] == 0
+    assert seen == {os.SCHED_OTHER}
+
+
 def test_a_terminal_that_waits(exported, tmp_path):
     """A robot whose view cannot be written, as after Ctrl-S, is still stopped in time, and its log is whole."""
     (end, full), log = os.pipe(), tmp_path / "log.mcap"
@@ -131,7 +140,7 @@ def test_a_terminal_that_waits(exported, tmp_path):
         with open(end, "rb") as output:
             said = output.read()
     assert time.monotonic() < until
-    assert process.returncode == 0 or b"stopped: all deadlines" in said  # as on a busy machine
+    assert process.returncode == 0 or b"were missed" in said or b"late ticks" in said  # as on a busy machine
     assert [rest["mode"] for *_, rest in RecordedLog(log).ticks()][-1] == "damping"
 
 

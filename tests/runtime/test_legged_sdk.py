@@ -1,6 +1,7 @@
 """A1 and Go1 through a stand-in for unitree_legged_sdk's Python module, which is in no package index."""
 
 import sys
+from collections import deque
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -16,15 +17,16 @@ from legged_torque.runtime.sim_robot import SimRobot
 
 
 class Udp:
-    """The SDK's UDP, at whose other end is a simulated A1, which tells its state once per command."""
+    """The SDK's UDP, at whose other end is a simulated A1, which tells its state once per command; states queue up."""
 
     def __init__(self, *place):
         assert place == (0xFF, 8080, "192.168.123.10", 8007)
         self.robot = SimRobot(resource_path("resources/robots/a1/a1.xml"), JOINT_ORDER, 500.0)
         self.InitCmdData = lambda command: setattr(command, "is_ready", True)
+        self.waiting = deque([self.robot.says()[0]])
 
     def Recv(self):  # noqa: N802
-        self.said = self.robot.says()[0] or self.said
+        self.said = self.waiting.popleft() if self.waiting else self.said
 
     def GetRecv(self, state):  # noqa: N802
         said = self.said
@@ -41,6 +43,7 @@ class Udp:
 
     def Send(self):  # noqa: N802
         self.robot.step(Received(self.sent))
+        self.waiting.extend(filter(None, [self.robot.says()[0]]))
 
 
 @pytest.fixture
@@ -78,9 +81,11 @@ def test_torques_alone_silence_and_mistakes(exported, sdk, tmp_path, monkeypatch
     robot.send(MotorCommand(zeros + 1.5, zeros, zeros, zeros, zeros))
     sent = robot._udp.sent
     assert (set(sent.tau), set(sent.q), set(sent.dq)) == ({1.5}, {2.146e9}, {16000.0})
-    assert robot.receive().newest is not None
-    robot._udp.robot.faults.silent = True
-    assert robot.receive().newest is None
+    for ticks in ([4], [], [68, 78]):  # of those that wait, the newest; at most 32 at a time
+        for expected in ticks:
+            assert robot.receive().newest.tick == expected
+        assert robot.receive().newest is None
+        robot._udp.waiting += [robot._udp.robot.says()[0] for _ in range(0 if ticks else 37)]
     with pytest.raises(ValueError, match="not finite"):
         robot.send(MotorCommand(zeros, zeros, zeros, zeros, zeros + np.nan))
     assert "unknown robot of unitree_legged_sdk 'go2'" in error_of(LeggedSdkRobot, "go2", 1)

@@ -84,7 +84,7 @@ def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path, keeps_tim
     controller, ticks = Controller(policy, policy.joint_order, RATE), 0
     session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller, keeps_time))
     for number in range(300):
-        late = number % 20 // 19 * 4
+        late = number % 100 // 99 * 4
         for _ in range(late * keeps_time):
             robot.step(Received())
         ticks += 1 + late
@@ -95,7 +95,7 @@ def test_the_robot_goes_on_while_the_program_is_late(policy, tmp_path, keeps_tim
     session.log.close()
     assert controller.mode == Mode.STAND
     gap = simulate(RecordedLog(tmp_path / "log.mcap"), robot_of(policy))
-    assert len(gap.times) == 300 and np.ptp(gap.logged, axis=0).max() > 0.1
+    assert len(gap.times) == 300 and np.ptp(gap.logged, axis=0).max() > 0.05
     np.testing.assert_allclose(gap.simulated, gap.logged, atol=1e-12)
 
 

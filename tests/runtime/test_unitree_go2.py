@@ -69,16 +69,8 @@ def test_bytes_of_a_command(command):
     told = zip(command.q, command.dq, command.tau, command.kp, command.kd, strict=True)
     motors = [(1, *numbers, 0, 0, 0) for numbers in told]
     motors += [(1, 2.146e9, 16000.0, 0.0, 0.0, 0.0, 0, 0, 0)] * 8
-    numbers = [
-        0xFE,
-        0xEF,
-        0xFF,
-        *[0] * 6,
-        *[number for motor in motors for number in motor],
-        *[0] * 59,
-        9,
-        message["crc"],
-    ]
+    numbers = [number for motor in motors for number in motor]
+    numbers = [0xFE, 0xEF, 0xFF, *[0] * 6, *numbers, *[0] * 59, 9, message["crc"]]
     expected = struct.pack("<4B4IH2x" + "B3x5f3I" * 20 + "4B" + "55Bx2I", *numbers)
     assert go2.packed(message) == expected and len(expected) == 812
     assert message["crc"] == shift_register(np.frombuffer(expected, np.uint8)[None])[0]
@@ -233,3 +225,5 @@ def test_what_the_wire_cannot_carry_is_not_sent(command, state, value):
         go2.encode_command(dataclasses.replace(command, kd=value), 1)
     with pytest.raises(go2.MessageError, match="joint_torques"):
         go2.encode_state(dataclasses.replace(state, joint_torques=value))
+    with pytest.raises(go2.MessageError, match="errors"):
+        go2.encode_state(dataclasses.replace(state, errors=value))

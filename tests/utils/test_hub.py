@@ -11,7 +11,9 @@ import yaml
 from huggingface_hub import constants
 from support import hub
 from support.scripts import ROOT, assert_told_in_one_line, run_here
+from support.settings import error_of
 
+from legged_torque.deploy import simulation
 from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
 from legged_torque.utils import devices
@@ -19,16 +21,8 @@ from legged_torque.utils.options import Options
 from legged_torque.utils.policies import policy_dir
 from legged_torque.utils.runs import load_config
 
-FILES = {
-    "README.md",
-    "card.yaml",
-    "config.yaml",
-    "index.html",
-    "model_1119.pt",
-    "page.json",
-    "policy.onnx",
-    "policy.yaml",
-}
+FILES = {"README.md", "card.yaml", "config.yaml", "index.html", "model_1119.pt", "page.json"}
+FILES |= {"policy.onnx", "policy.yaml"}
 
 
 @pytest.fixture(scope="module")
@@ -42,11 +36,8 @@ def server():
 def script(server, tmp_path, monkeypatch):
     """Runs a script that takes the stand-in for the Hub."""
     files = f"{server.address}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
-    patched = {
-        "ENDPOINT": server.address,
-        "HUGGINGFACE_CO_URL_TEMPLATE": files,
-        "HF_HUB_CACHE": str(tmp_path / "cache"),
-    }
+    patched = {"ENDPOINT": server.address, "HUGGINGFACE_CO_URL_TEMPLATE": files}
+    patched |= {"HF_HUB_CACHE": str(tmp_path / "cache")}
     for name, value in patched.items():
         monkeypatch.setattr(constants, name, value)
     monkeypatch.setenv("HF_TOKEN", "hf_none")
@@ -126,6 +117,24 @@ def test_an_export_in_the_folder_of_the_command(script, tmp_path):
     shutil.copytree(policy_dir("a1/position"), tmp_path / "here", dirs_exist_ok=True)
     status, _, errors = script("publish.py", "policy.onnx", "--out=../out")
     assert status == 0 and {path.name for path in (tmp_path / "out").iterdir()} >= FILES, errors
+
+
+def test_cards_that_lack_something(script, tmp_path, monkeypatch):
+    """They are refused in a line, before anything is simulated; what they have beyond that does no harm."""
+    write_cards = runpy.run_path(str(ROOT / "scripts" / "publish.py"))["write_cards"]
+    shutil.copytree(policy_dir("a1/position"), folder := tmp_path / "here" / "mine")
+    card = yaml.safe_load((folder / "card.yaml").read_text())
+    write_cards(folder, card | {"names": "x", "rows": 3, "license_line": []})
+    metrics = {name: [1.0, 0.1] for name in ("track_percentage", "falls_per_minute", "cost_of_transport")}
+    wrong = [{"steps": "many"}, {"policy": 3}, {"task": None}, {"license": 3}, {"metrics": None}]
+    wrong += [{"metrics": {"low": metrics | {"falls_per_minute": value}}} for value in ([1.0], 1.0, ["a", "b"])]
+    for change in wrong:
+        assert "must have policy, task, steps, and in metrics" in error_of(write_cards, folder, card | change)
+    del card["steps"]
+    (folder / "card.yaml").write_text(yaml.safe_dump(card))
+    monkeypatch.setattr(simulation, "evaluate", lambda *_: pytest.fail("it is simulated"))
+    assert_told_in_one_line(script("publish.py", "mine"), "(KeyError: 'steps')")
+    assert [path.name for path in (tmp_path / "here").iterdir()] == ["mine"]
 
 
 def test_no_network(script, monkeypatch):
