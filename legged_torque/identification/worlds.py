@@ -40,7 +40,10 @@ class HangingRobots:
     """
 
     def __init__(self, cfg: Any, recording: Recording, device: str) -> None:
-        """Hang the robot of a task's settings up as that of a log; a UserError if it lacks joints of the log."""
+        """Hang the robot of a task's settings up as that of a log.
+
+        A UserError if it lacks joints of the log, or the log lacks joints that hang on a branch with others of it.
+        """
         self._recording, wanted = recording, recording.joint_order
         self._substeps = int(np.ceil(recording.period / STEP - 1e-9))
         self._step = recording.period / self._substeps
@@ -48,9 +51,11 @@ class HangingRobots:
         model, names = asset.mj_model, asset.dof_names
         refuse([str(unknown_name("joint of the log", name, names)) for name in wanted if name not in names])
         self._order = order = [names.index(name) for name in wanted]
-        chains = [[int(joint) - 1 for joint in chain] for chain in read_tree(model).joints]
-        branches = [[order.index(joint) for joint in chain if joint in order] for chain in chains]
-        self.branches = [branch for branch in branches if branch]
+        chains = [[joint - 1 for joint in chain if joint > 0] for chain in read_tree(model).joints.tolist()]
+        chains = [chain for chain in chains if not set(chain).isdisjoint(order)]
+        limp = [names[joint] for chain in chains for joint in chain if joint not in order]
+        refuse([f"the log lacks joints of the branches that it has: {', '.join(limp)}"] if limp else [])
+        self.branches = [[order.index(joint) for joint in chain] for chain in chains]
         self.num_worlds = 2 * (4 * max(map(len, self.branches)) + 1) + 1
         self.torque_limits, none = model.actuator_ctrlrange[order].T, np.zeros(len(order))
         self.file_values = np.array([*(getattr(model, field)[6:][order] for field in FIELDS.values()), none, none])

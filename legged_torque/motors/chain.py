@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged_torque.motors.config import MotorCfg, check_encoders
+from legged_torque.motors.config import MotorCfg, check_single
 from legged_torque.motors.kernel import Part, TorqueKernel, joint_torque, newest_actions
 from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
@@ -27,7 +27,8 @@ class MotorChain:
     def __init__(self, settings: Any, joints: Joints) -> None:
         """Build the links of a section ``motors`` of settings.
 
-        A UserError names a link without a section, one that occurs twice, or one of actions behind one of torques.
+        A UserError names a link without a section, one that occurs twice, one of actions behind one of torques, and
+        several of actions or of measurements.
         """
         known = [name for name, value in vars(settings).items() if isinstance(value, MotorCfg)]
         self.links: dict[str, Motor] = {}
@@ -40,8 +41,10 @@ class MotorChain:
         self._of_actions, self._behind_law = (
             [link for link in self.links.values() if (link.acts_on == "actions") == early] for early in (True, False)
         )
+        early = [name for name, link in self.links.items() if link in self._of_actions]
+        check_single("motors.chain", "link that acts on actions", early)
         encoders = {name: link for name, link in self.links.items() if link.acts_on == "measurements"}
-        check_encoders("motors.chain", list(encoders))
+        check_single("motors.chain", "encoder", list(encoders))
         self.encoder: Any = next(iter(encoders.values()), None)
         if list(self.links.values()) != [*self._of_actions, *self._behind_law]:
             raise UserError(f"motors.chain must have links that act on actions first, not {', '.join(self.links)}")
@@ -96,7 +99,7 @@ class MotorChain:
 
         Joint positions [rad], velocities [rad/s], and where it writes torques [N m]. Shapes: (num_envs, num_dof).
         """
-        if not law or len(self._of_actions) > 1 or any(link.kernel is None for link in self.links.values()):
+        if not law or any(link.kernel is None for link in self.links.values()):
             return None
         parts = {link: (link.kernel, link.kernel_reads()) for link in self.links.values()}
         actions: Any = parts[self._of_actions[0]] if self._of_actions else (newest_actions, self._actions)

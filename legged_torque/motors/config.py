@@ -77,10 +77,10 @@ class PerturbationCfg(MotorCfg):
     of_vel: NotNegative = 0.1  # [s/rad]
 
 
-def check_encoders(where: str, names: Sequence[str]) -> None:
-    """Raise a UserError if there are several links that act on measurements."""
+def check_single(where: str, kind: str, names: Sequence[str]) -> None:
+    """Raise a UserError if there are several links of a kind."""
     if len(names) > 1:
-        raise UserError(f"{where} must have one encoder at most, not {', '.join(names)}")
+        raise UserError(f"{where} must have one {kind} at most, not {', '.join(names)}")
 
 
 def by_joint(setting: str, values: float | dict[str, float], dof_names: Sequence[str]) -> list[float]:

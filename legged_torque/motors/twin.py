@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.motors.config import check_encoders
+from legged_torque.motors.config import check_single
 from legged_torque.motors.formulas import FORMULAS
 from legged_torque.motors.model_config import MODELS
 from legged_torque.utils.config import update_from_dict
@@ -37,7 +37,8 @@ class MotorTwin:
                 raise UserError(f"no numpy function for the motor '{link}'")
             motor = SimpleNamespace(**robot, **constants(described, names, f"motors.{link}", robot["dt"]))
             self._links.append((FORMULAS[described["model"]], motor))
-        check_encoders("motors", [link for link, described in links.items() if described["model"] == "encoder"])
+        encoders = [link for link, described in links.items() if described["model"] == "encoder"]
+        check_single("motors", "encoder", encoders)
         self._shape = (len(names),)
         self.reset()
 

@@ -1,8 +1,11 @@
 """The engine "mujoco_warp": MuJoCo Warp's own step, for any robot that it can simulate."""
 
+from collections.abc import Sequence
+
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
+from torch import Tensor
 
 from legged_torque.sim import kernels
 from legged_torque.sim.fused.tree import SLOWER, reasons_against
@@ -37,3 +40,11 @@ class MuJoCoWarpEngine(WarpEngine):
         with wp.ScopedDevice(self._wp_device):
             wp.launch(kernels.clear_nan_ctrl, self.num_envs, [self._data.ctrl, self._diverged])
             mjw.step(self._model, self._data)
+
+    def field(self, name: str, columns: Sequence[int] | None = None) -> Tensor:
+        """Return a field; pairs of geoms are not sorted out by their file's sizes any more if these may change."""
+        if name == "geom_size":
+            self._model.opt.broadphase_filter = 0
+            bounds = wp.to_torch(self._model.geom_rbound)  # which height fields and sorted geoms read, too
+            bounds[bounds > 0.0] = mujoco.mjMAXVAL  # 0 stands for planes
+        return super().field(name, columns)

@@ -41,9 +41,14 @@ class RandomParameter:
     same_draw_as: str | None = None  # name of an earlier parameter whose draws it takes
     may_keep: bool = False  # whether it keeps its own value in a share of the draws
     limits: tuple[Sequence[float], Sequence[float]] | None = None  # lowest and highest, per column, to clip draws to
-    at_least: float = -math.inf  # what no draw may be below
+    at_least: float = -math.inf  # what no draw may be below, in the sign of the ranges
     at_reset_only: bool = False  # whether it is drawn at resets only
     mirror: Mirroring | None = None  # of the numbers listed; None: one number is its own image, several are unknown
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether any range has more than one number."""
+        return any(low < high for low, high in self.draw.values())
 
     @property
     def num_listed(self) -> int:
@@ -60,7 +65,7 @@ class Randomization:
     Attributes:
         parameters: What is drawn.
         fields: The tensors in which the parameters are kept, by the name of the model's field or of the parameter.
-        sizes: How many numbers of their own the parameters have, by name; those that take others' draws are left out.
+        sizes: How many numbers are listed of the parameters, by name: of those that share draws, one that is drawn.
         values: These numbers as they are now, from -1, the lowest one possible, to 1. Shape: (num_envs, their sum).
         seeds: From which the next draw follows; new ones are written by who draws. Shape: (num_envs,), int32.
     """
@@ -85,12 +90,14 @@ class Randomization:
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
+        listed = {each.same_draw_as or each.name: each for each in parameters[::-1]}
+        listed |= {each.same_draw_as or each.name: each for each in parameters[::-1] if each.is_drawn}
         for parameter in parameters:
-            field = self._field(parameter, model_field)
-            start = first_draw.setdefault(parameter.same_draw_as or parameter.name, num_draws)
-            is_new = start == num_draws
-            if is_new:
+            field, of_draw = self._field(parameter, model_field), parameter.same_draw_as or parameter.name
+            start, is_listed = first_draw.setdefault(of_draw, num_draws), listed[of_draw] is parameter
+            if is_listed:
                 self.sizes[parameter.name] = parameter.num_listed
+            if start == num_draws:
                 num_draws += 1 if parameter.shared else len(parameter.columns)
             column_draw = num_draws if "scale_per_joint" in parameter.draw else None
             num_draws += len(parameter.columns) if column_draw is not None else 0
@@ -101,7 +108,7 @@ class Randomization:
                 row.draw = start + (0 if parameter.shared else i)
                 row.column_draw = -1 if column_draw is None else column_draw + i
                 row.place = -1
-                if is_new and i < parameter.num_listed:
+                if is_listed and i < parameter.num_listed:
                     row.place = len(at_start)
                     at_start.append((row.own_value - row.middle) * row.per_half_range)
                 rows.append(row)
@@ -180,9 +187,10 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
         row.column_low, row.column_span = of_column[0], of_column[1] - of_column[0]
         row.keep_probability = keep_probability if parameter.may_keep else 0.0
         corners = [(base + weight * add) * factor * other for add, factor, other in product(offset, scale, of_column)]
-        if min(corners) < parameter.at_least:
+        lowest_draw = min(math.copysign(1.0, weight) * corner for corner in corners)
+        if lowest_draw < parameter.at_least:
             raise UserError(
-                f"random parameter '{parameter.name}' can be {min(corners):g} with the ranges given; it must be at "
+                f"random parameter '{parameter.name}' can be {lowest_draw:g} with the ranges given; it must be at "
                 f"least {parameter.at_least:g}"
             )
         half_range = (max(corners) - min(corners)) / 2

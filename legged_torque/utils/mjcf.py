@@ -170,8 +170,8 @@ def set_joints(model: mujoco.MjModel, values: Mapping[str, Mapping[str, float]])
 
 def hang_up(model: mujoco.MjModel) -> None:
     """Give a model a trunk so heavy that legs do not move it, and no contacts; a force has to carry its weight."""
-    of_robot, inertia = model.geom_bodyid > 0, float(model.stat.meaninertia)
-    model.geom_contype[of_robot] = model.geom_conaffinity[of_robot] = 0
+    inertia = float(model.stat.meaninertia)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     model.body_mass[1], model.body_inertia[1], model.body_ipos[1] = HELD, HELD, 0.0
     mujoco.mj_setConst(model, mujoco.MjData(model))
     model.stat.meaninertia = inertia  # by which solvers judge their progress
@@ -189,8 +189,10 @@ def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
 
     Their ``contype`` and ``conaffinity`` match, and their bodies are neither the same, nor parent and child, nor
-    excluded; or they are a ``<pair>``.
+    excluded; or they are a ``<pair>``. None if the model disables contacts.
     """
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
+        return np.empty((0, 2), int)
     first, second = np.triu_indices(model.ngeom, k=1)
     bodies = model.geom_bodyid[[first, second]]
     welds = model.body_weldid[bodies]  # bodies without joints are parts of their parents

@@ -17,6 +17,7 @@ MOTOR_FILES = (".yaml", ".yml")
 OF_MOTORS = ("motors", "domain_rand")  # sections that such files may have
 LAW = "motors.chain (control law)"
 PUSH = "push_velocity"
+CONTACT = ("contact_stiffness", "contact_damping")  # which are drawn together
 DELAYS = {"action_delay": "motors.delay.range", "sensing_delay": "sensing.delay.range"}
 """What ``evaluate.py --sweep`` takes besides parameters of ``domain_rand``: pushes, and delays with their settings."""
 
@@ -176,7 +177,8 @@ def draw_only(env_cfg: Any, name: str) -> None:
         for link in (getattr(env_cfg.motors, key, None) for key in env_cfg.motors.chain):
             if link is not None and hasattr(link, "draws"):
                 link.draws = {}
-    rand.keep_fixed = [other for other in rand.keep_fixed if other != name]
+    freed = CONTACT if name in CONTACT else (name,)
+    rand.keep_fixed = [other for other in rand.keep_fixed if other not in freed]
 
 
 def _named(kind: str, name: str, choices: dict[str, dict[str, Any]]) -> dict[str, Any]:

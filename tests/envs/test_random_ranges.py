@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from support.robot_files import changed as changed  # a fixture
+from support.robot_files import setting
 from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -109,3 +111,40 @@ def test_sums_that_make_no_sense(make_task, name, limits, message):
     """A range that can make a parameter negative is refused if it is drawn."""
     make_task("a1_torque", 1, **{f"domain_rand.{name}": limits})
     assert message in error_of(make_task, "a1_torque", 1, **ON, **{f"domain_rand.{name}": limits})
+
+
+@pytest.mark.parametrize(
+    ("settings", "drawn", "kept"),
+    [
+        ({"keep_fixed": ["contact_damping"]}, "contact_stiffness", "contact_damping"),
+        ({"contact_stiffness": {"scale": [0.9, 1.1]}}, "contact_damping", "contact_stiffness"),
+    ],
+)
+def test_formats_of_solref(changed, make_task, settings, drawn, kept):
+    """Numbers of the direct format are not drawn beside one of the other format, but by themselves or in pairs."""
+    settings = ON | {f"domain_rand.{name}": value for name, value in settings.items()}
+    make_task("a1_position", 1, **settings)
+    file = {"asset.file": changed(setting(".//geom[@solref]", solref="0.02 1"))}
+    line = error_of(make_task, "a1_position", 1, **file, **settings)
+    assert f"draws {drawn} in MuJoCo's direct format" in line and f"the robot's own {kept} is of the other one" in line
+    make_task("a1_position", 1, **file, **ON)
+    scaled = {f"domain_rand.contact_{name}": {"add": [-0.01, 0.01]} for name in ("stiffness", "damping")}
+    solref = make_task("a1_position", 50, **file, **ON, **scaled).sim.field("geom_solref")[:, 0]
+    assert 0.01 <= solref[:, 0].min() < 0.011 and 0.029 < solref[:, 0].max() <= 0.03
+
+
+def test_sums(make_task):
+    """Numbers that are added make gravity, contacts and all kinds of friction stronger where they are positive."""
+    ranges = {"gravity": [0.5, 1.0], "contact_stiffness": [100, 200], "contact_damping": [10, 20]}
+    ranges["ground_friction"] = [0.5, 1.0]
+    task = make_task("a1_position", 50, **ON, **{f"domain_rand.{key}": {"add": ends} for key, ends in ranges.items()})
+    model, sim = task.sim.mj_model, task.sim
+    share = (-9.81 - sim.field("gravity")[:, 2].numpy() - 0.5) / 0.5
+    assert 0.0 <= share.min() < 0.1 and 0.9 < share.max() <= 1.0
+    stiffness, damping = -sim.field("geom_solref")[:, 0].numpy().T
+    share = (stiffness - 1100.0) / 100.0
+    assert 0.0 <= share.min() < 0.1 and 0.9 < share.max() <= 1.0
+    np.testing.assert_allclose(damping, 90.0 + 10.0 * share, rtol=1e-5)
+    friction = sim.field("geom_friction")[:, 0].numpy() / model.geom_friction[0]
+    assert 1.5 <= friction.min() < 1.6 and 1.9 < friction.max() <= 2.0
+    np.testing.assert_allclose(friction, friction[:, :1].repeat(3, axis=1), rtol=1e-5)

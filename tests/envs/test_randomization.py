@@ -179,6 +179,13 @@ def test_critic_knows_what_was_drawn(make_task):
     ):
         torch.testing.assert_close(values[name], 2.0 * (number - low) / (high - low) - 1.0, atol=1e-4, rtol=0)
     assert torch.equal(task.get_observations()["critic"][:, -117:], task.randomization.values)
+    for fixed, number, low, high in (("stiffness", 1, -88.0, -72.0), ("damping", 0, -1100.0, -900.0)):
+        one = make_task("a1_position", 20, **ON, **{"domain_rand.keep_fixed": [f"contact_{fixed}"]})
+        place = sum(list(sizes.values())[: list(sizes).index("contact_stiffness")])
+        drawn = one.sim.field("geom_solref")[:, 0, number]
+        expected = 2.0 * (drawn - low) / (high - low) - 1.0
+        torch.testing.assert_close(one.randomization.values[:, place], expected, atol=1e-4, rtol=0)
+        assert one.randomization.values.shape[1] == 117 and drawn.std() > 1.0
     plain = make_task("a1_position", 2)
     seen = plain.get_observations()["critic"][0, -117:].split([*sizes.values()])
     values = dict(zip(sizes, seen, strict=True))

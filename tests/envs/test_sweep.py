@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from support.robot_files import changed as changed  # a fixture
+from support.robot_files import setting
 from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import error_of
 
@@ -87,6 +89,15 @@ def test_a_parameter_that_is_kept(make_task):
     rand = {f"domain_rand.{key}": getattr(cfg.domain_rand, key) for key in ("randomize_parameters", "keep_fixed")}
     edges = Sweep(make_task("a1_position", 2, **rand), "gravity").edges
     assert (edges[0], edges[-1]) == (9.51, 10.11)
+
+
+def test_both_numbers_of_contacts(changed, make_task):
+    """They are drawn together: one beside the file's would be of another format."""
+    file = changed(setting(".//geom[@solref]", solref="0.02 1"))
+    task = swept(make_task, "contact_stiffness", **{"asset.file": file})
+    stiffness, damping = -task.sim.field("geom_solref")[:, 0].T
+    torch.testing.assert_close(damping, 72.0 + (stiffness - 900.0) * 0.08)
+    assert Sweep(task, "contact_stiffness").edges[0] == 900.0
 
 
 def test_links_that_do_not_exist(make_task):

@@ -270,7 +270,7 @@ def test_the_control_law_keeps_its_drive():
     for choice, rest in (("ideal", ["ideal"]), ("real", ["ideal", "urdf"])):
         motors = task_registry.get_cfgs("a1_torque_damped", Options(device="cpu", motors=choice))[0].motors
         assert motors.chain == ["delay", "drive", *rest] and motors.drive.damping == 0.5
-    motors.choices["own"] = ["delay", "smooth", "ideal"]  # of which two act on actions
+    motors.choices["own"] = ["delay", "smooth", "ideal"]  # of which one is not known
     motors.choose("own")
     assert motors.chain == ["delay", "smooth", "drive", "ideal"]
     motors.network.file = "of_the_task.json"

@@ -10,7 +10,7 @@ from support.settings import error_of, torques_in_torch
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import IN_TORCH
 from legged_torque.envs.tasks import A1TorqueCfg
-from legged_torque.motors.config import MotorCfg
+from legged_torque.motors.config import DelayCfg, MotorCfg
 from legged_torque.motors.kernel import read
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
@@ -154,6 +154,9 @@ class OwnMotorsCfg(A1TorqueCfg):
         class quick(SlewCfg):
             rate = 4000.0
 
+        class bus(DelayCfg):
+            pass
+
 
 def make(num_envs=3, chain=("delay", "curve", "slew"), **changes):
     """A task with these motors, high up in the air."""
@@ -235,10 +238,11 @@ def test_own_state_and_parameters():
 
 
 def test_mistakes():
-    """Links that do not exist, occur twice or in the wrong order are refused by name."""
+    """Links that do not exist, occur twice, in the wrong order or in vain are refused by name."""
     assert "unknown motors.chain 'curv'; did you mean 'curve'?" in error_of(make, 1, ("curv",))
     assert "has the link 'slew' twice" in error_of(make, 1, ("slew", "slew"))
     assert "links that act on actions first" in error_of(make, 1, ("curve", "delay"))
+    assert "one link that acts on actions at most, not delay, bus" in error_of(make, 1, ("delay", "bus", "curve"))
 
 
 def test_sata(make_task):

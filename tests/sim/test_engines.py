@@ -1,13 +1,15 @@
 """The engines of the package: what all of them must do, and what is special about each."""
 
+import numpy as np
 import pytest
 import torch
 from support.engine_suite import LEG_UP, EngineSuite
 from support.fused import compiled, make_a1
-from support.simulator import SENSED
+from support.simulator import LEGS, SENSED
 
 from legged_torque.sim import mjwarp
 from legged_torque.sim.registry import make_engine
+from legged_torque.terrain.height_grid import HeightGrid
 from legged_torque.utils.errors import UserError
 
 
@@ -55,6 +57,29 @@ class TestMuJoCoWarp(EngineSuite):
             found = dict(zip(SENSED, sim.contact_found[world].tolist(), strict=True))
             assert found.pop("trunk") >= 4
             assert found == {name: 1 if name.endswith(("foot", "hip")) else 2 for name in found}  # spheres, capsules
+
+    @pytest.mark.parametrize("on_map", [False, True], ids=["plane", "map"])
+    def test_feet_that_are_larger(self, on_map):
+        """They meet the ground where those of a robot do whose file has their size."""
+        found, forces = [], []
+        for radius, own in ((0.02, 0.03), (0.03, 0.03)):
+            spec = make_a1()
+            for geom in spec.geoms:
+                if geom.name.endswith("foot"):
+                    geom.size[0] = radius
+                elif geom.name != "floor":
+                    geom.contype = geom.conaffinity = 0
+            if on_map:
+                HeightGrid(np.zeros((3, 3)), 1.0, (-1.0, -1.0)).add_to(spec, "floor")
+            sim = self.make(2, compiled(spec))
+            sizes, feet = sim.field("geom_size"), [sim.mj_model.geom(f"{leg}_foot").id for leg in LEGS]
+            sizes[1, feet, 0] = own
+            sim.qpos.copy_(torch.tensor([0, 0, 0.343, 1, 0, 0, 0, *(0.0, 0.0, -0.95) * 4]))  # feet 27 mm high
+            sim.step()
+            found.append(sim.contact_found)
+            forces.append(sim.contact_force)
+        assert not found[0][0].any() and found[0][1].all()
+        assert torch.equal(found[0][1], found[1][1]) and torch.equal(forces[0][1], forces[1][1])
 
     @pytest.mark.parametrize(
         ("buffer", "size", "name"), [("max_contacts", 6, "NARROWPHASE"), ("max_constraints", 20, "NEFC")]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import body_chains
+from legged_torque.utils.mjcf import body_chains, hang_up
 from legged_torque.utils.standing import hold_pose
 
 
@@ -27,6 +27,20 @@ def test_body_chains(text, chains):
     """There is a chain for each end of the tree, in the file's order; chains share bodies above a branch."""
     model = tree(text)
     assert ["".join(model.body(body).name for body in chain) for chain in body_chains(model)] == chains
+
+
+def test_a_robot_that_hangs():
+    """It touches nothing, not even by a <pair> of parts that overlap."""
+    parts = '<geom name="{0}" size="0.1"/>'
+    body = f"<body><freejoint/>{parts.format('a')}<body><joint/>{parts.format('b')}</body></body>"
+    floor, pair = '<geom type="plane" size="1 1 1"/>', '<contact><pair geom1="a" geom2="b"/></contact>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{floor}{body}</worldbody>{pair}</mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 3
+    hang_up(model)
+    mujoco.mj_forward(model, data)
+    assert data.ncon == 0
 
 
 TABLE = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>

@@ -15,6 +15,7 @@ from legged_torque.sim.randomization import RandomParameter, fixed
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 from legged_torque.utils.mjcf import joint_limits
+from legged_torque.utils.options import CONTACT
 
 TRUNK = 1  # the trunk's body
 _ROUND = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}  # types of feet that have a radius
@@ -86,18 +87,17 @@ def robot_parameters(
 
     def of_joints(name: str, field: str, columns: Sequence[int], unit: str, add_unit: Any = 1.0) -> RandomParameter:
         """Return a parameter with a number per joint."""
-        return RandomParameter(
-            name, field, columns, draws[name], unit, add_unit=add_unit, may_keep=True, mirror=joint_values
-        )
+        more: dict[str, Any] = {"may_keep": True, "at_least": 0.0, "mirror": joint_values}
+        return RandomParameter(name, field, columns, draws[name], unit, add_unit=add_unit, **more)
 
-    mass, inertia = draws["trunk_mass"], entries(3, [TRUNK])
+    mass, inertia, radii = draws["trunk_mass"], entries(3, [TRUNK]), [3 * foot for foot in feet]
     trunk: dict[str, Any] = {"shared": True, "add_unit": inertia_per_mass}
     com: dict[str, Any] = {"shared": True, "listed_by_column": True, "mirror": VECTOR}
     return [
         RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg", at_least=LEAST_MASS),
         RandomParameter("trunk_inertia", "body_inertia", inertia, mass, "kg m^2", same_draw_as="trunk_mass", **trunk),
         RandomParameter("trunk_com", "body_ipos", entries(3, [TRUNK]), draws["trunk_com"], "m", **com),
-        RandomParameter("foot_radius", "geom_size", [3 * foot for foot in feet], foot_radius, "m", shared=True),
+        RandomParameter("foot_radius", "geom_size", radii, foot_radius, "m", shared=True, at_least=0.0),
         RandomParameter("foot_pos", "geom_pos", entries(3, feet), draws["foot_pos"], "m", mirror=foot_vectors),
         of_joints("dof_damping", "dof_damping", dofs, "N m s/rad", control.d_gains[0].tolist()),
         of_joints("dof_armature", "dof_armature", dofs, "kg m^2"),
@@ -111,15 +111,21 @@ def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[R
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     friction = model.geom_friction[geoms]  # tangential, torsional, rolling
     kinds = list((friction / friction[:, :1]).ravel())
-    stiffness, damping = [2 * geom for geom in geoms], [2 * geom + 1 for geom in geoms]
-    solref: dict[str, Any] = {"shared": True, "set_unit": -1.0}  # MuJoCo's direct format has negative numbers
-    shared: dict[str, Any] = {"shared": True, "set_unit": kinds}
-    late: dict[str, Any] = {"same_draw_as": "contact_stiffness"}
+    slides: dict[str, Any] = {"shared": True, "set_unit": kinds, "add_unit": kinds, "at_least": 0.0}
+
+    def of_solref(part: int, **more: Any) -> RandomParameter:
+        """Return a number of all solrefs; those of MuJoCo's direct format, which are set, are negative."""
+        name, own = CONTACT[part], model.geom_solref[geoms, part].tolist()
+        columns, signs = [2 * geom + part for geom in geoms], [1.0 if number > 0.0 else -1.0 for number in own]
+        more |= {"own": own, "set_unit": -1.0, "add_unit": signs, "shared": True, "at_least": 0.0}
+        return RandomParameter(name, "geom_solref", columns, draws[name], **more)
+
+    down: dict[str, Any] = {"set_unit": -1.0, "add_unit": -1.0, "at_least": 0.0}
     return [
-        RandomParameter("ground_friction", "geom_friction", entries(3, geoms), draws["ground_friction"], **shared),
-        RandomParameter("contact_stiffness", "geom_solref", stiffness, draws["contact_stiffness"], **solref),
-        RandomParameter("contact_damping", "geom_solref", damping, draws["contact_damping"], **late, **solref),
-        RandomParameter("gravity", "gravity", [2], draws["gravity"], "m/s^2", set_unit=-1.0),
+        RandomParameter("ground_friction", "geom_friction", entries(3, geoms), draws["ground_friction"], **slides),
+        of_solref(0),
+        of_solref(1, same_draw_as=CONTACT[0]),
+        RandomParameter("gravity", "gravity", [2], draws["gravity"], "m/s^2", **down),
     ]
 
 
@@ -132,14 +138,14 @@ def control_parameters(
     """
     joints, mirror = range(strength.shape[1]), symmetry.joints
 
-    def of_joints(name: str, field: Tensor, unit: str, least: float) -> RandomParameter:
+    def of_joints(name: str, field: Tensor, unit: str) -> RandomParameter:
         """Return a parameter with one draw for all joints, and one per joint if it has such a range."""
         images = mirror.unsigned() if mirror and "scale_per_joint" in draws[name] else None
-        return RandomParameter(name, field, joints, draws[name], unit, shared=True, at_least=least, mirror=images)
+        return RandomParameter(name, field, joints, draws[name], unit, shared=True, at_least=0.0, mirror=images)
 
     scale = draws["action_scale"]
     return [
-        of_joints("motor_strength", strength, "", -math.inf),
+        of_joints("motor_strength", strength, ""),
         RandomParameter("joint_offset", control.joint_offset, joints, draws["joint_offset"], "rad", mirror=mirror),
         RandomParameter("action_scale", control.action_scale, [0], scale, "rad", at_least=0.0),
         RandomParameter(
@@ -151,8 +157,8 @@ def control_parameters(
             same_draw_as="action_scale",
             add_unit=control.torque_per_position,
         ),
-        of_joints("stiffness", control.p_gains, "N m/rad", 0.0),
-        of_joints("damping", control.d_gains, "N m s/rad", 0.0),
+        of_joints("stiffness", control.p_gains, "N m/rad"),
+        of_joints("damping", control.d_gains, "N m s/rad"),
     ]
 
 
@@ -160,15 +166,30 @@ def with_settings(parameters: Sequence[RandomParameter], rand: Any, draws: Mappi
     """Return parameters as ``domain_rand`` asks for: those of ``keep_fixed`` keep their own values.
 
     Parameters without ranges of their own in ``draws`` go with the one whose draws they take. Bounds hold only where
-    anything is drawn.
+    anything is drawn; a UserError if solrefs would mix their two formats there.
     """
     kept = []
     for parameter in parameters:
         setting = parameter.name if parameter.name in draws else parameter.same_draw_as or parameter.name
         kept.append(fixed(parameter) if setting in rand.keep_fixed else parameter)
     if rand.randomize_parameters:
+        _refuse_mixed_solrefs([parameter for parameter in kept if parameter.name in CONTACT])
         return kept
     return [dataclasses.replace(parameter, at_least=-math.inf) for parameter in kept]
+
+
+def _refuse_mixed_solrefs(drawn: Sequence[RandomParameter]) -> None:
+    """Raise a UserError if one of :data:`CONTACT` is set, and the robot's own value of the other is of another format.
+
+    MuJoCo reads two positive numbers as a time constant and a damping ratio, and has no meaning for a mixture.
+    """
+    are_set = [parameter.name for parameter in drawn if "set" in parameter.draw]
+    are_kept: Any = [parameter for parameter in drawn if parameter.name not in are_set]
+    if are_set and any(number > 0.0 for parameter in are_kept for number in parameter.own):
+        raise UserError(
+            f"domain_rand draws {are_set[0]} in MuJoCo's direct format of solref, and the robot's own "
+            f"{are_kept[0].name} is of the other one: set ranges of both, or keep both fixed"
+        )
 
 
 def mirrors(drawn: Sequence[RandomParameter], sizes: Mapping[str, int]) -> dict[str, Mirroring | None]:

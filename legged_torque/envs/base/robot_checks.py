@@ -9,7 +9,7 @@ from torch import Tensor
 from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import Mirroring
-from legged_torque.utils.mjcf import body_chains, joint_limits
+from legged_torque.utils.mjcf import body_chains, colliding_pairs, joint_limits
 
 MIRROR_TOLERANCE = 5e-3  # by which a foot may miss the mirror image of its counterpart [m]
 _POSES = 5  # random ones that are mirrored
@@ -36,10 +36,10 @@ def foot_notes(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
 
 def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
     """Yield feet that fall through the ground with every engine."""
-    kinds, floor = (model.geom_contype, model.geom_conaffinity), model.geom(FLOOR).id
-    through = [f for f in feet if not any(a[floor] & b[model.geom(f).id] for a, b in (kinds, kinds[::-1]))]
+    pairs, floor = colliding_pairs(model), model.geom(FLOOR).id
+    through = [foot for foot in feet if model.geom(foot).id not in pairs[(pairs == floor).any(axis=1)]]
     if through:
-        yield f"contype and conaffinity let {', '.join(through)} through the geom '{FLOOR}'"
+        yield f"contype, conaffinity or a flag let {', '.join(through)} through the geom '{FLOOR}'"
 
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:

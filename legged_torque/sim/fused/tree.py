@@ -11,7 +11,7 @@ import numpy as np
 
 from legged_torque.sim.fused.surface import FAR, NEAR
 from legged_torque.utils.errors import refuse
-from legged_torque.utils.mjcf import body_chains, self_pairs, why_no_motor
+from legged_torque.utils.mjcf import body_chains, colliding_pairs, self_pairs, why_no_motor
 
 MAX_BRANCHES = 16  # threads of a world must fit into half a warp
 _SELF_KINDS = [mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
@@ -138,9 +138,11 @@ def _of(part: Any, chosen: np.ndarray) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-_HARMLESS_DISABLED = ("midphase", "nativeccd", "multiccd", "island", "autoreset", "warmstart", "equality")
+_HARMLESS_DISABLED = ("contact", "midphase", "nativeccd", "multiccd", "island", "autoreset", "warmstart", "equality")
 _HARMLESS_ENABLED = ("energy", "fwdinv", "invdiscrete", "multiccd")
-"""Flags that change no motion of a robot without equalities and convex collisions; a minimum has no warm start."""
+"""Flags that change no motion of a robot without equalities and convex collisions; a minimum has no warm start.
+
+Without contacts, no geoms meet."""
 _INTEGRATORS = (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, mujoco.mjtIntegrator.mjINT_EULER)
 """Both are the same if linear damping of joints is the only force that depends on velocities."""
 
@@ -245,9 +247,8 @@ def _floors(model: mujoco.MjModel, types: Sequence[mujoco.mjtGeom]) -> np.ndarra
 
 def _touching(model: mujoco.MjModel, floor: int) -> np.ndarray:
     """Return which geoms of the robot can touch the floor. Shape: (ngeom,), bool."""
-    by_type = model.geom_contype & model.geom_conaffinity[floor]
-    by_affinity = model.geom_conaffinity & model.geom_contype[floor]
-    return ((by_type | by_affinity) != 0) & (model.geom_bodyid > 0)
+    pairs = colliding_pairs(model)
+    return np.isin(np.arange(model.ngeom), pairs[(pairs == floor).any(axis=1)]) & (model.geom_bodyid > 0)
 
 
 def _condims(model: mujoco.MjModel, pairs: np.ndarray) -> np.ndarray:
