@@ -36,11 +36,14 @@ def plot_sweeps() -> None:
     check_output(args.out)
     check_extra()
     pyplot = load_pyplot()
-    sweeps = [read_data(file, {"task", "sweep"}, "evaluate.py --sweep") for file in args.files]
-    lines: dict[tuple[str, str, str], list[dict[str, Any]]] = defaultdict(list)
-    for content in sweeps:
-        robot, *rest = re.split(APPROACH, content["task"], maxsplit=1)
-        lines[robot, (rest or [robot])[0], content["sweep"]["parameter"]].append(content["sweep"])
+    script, lines = "evaluate.py --sweep", defaultdict[tuple[str, str, str], list[dict[str, Any]]](list)
+    for file in args.files:
+        content = read_data(file, {"task", "sweep"}, script)
+        try:
+            robot, *rest = re.split(APPROACH, content["task"], maxsplit=1)
+            lines[robot, (rest or [robot])[0], content["sweep"]["parameter"]].append(content["sweep"])
+        except (LookupError, TypeError):
+            raise UserError(f"'{file}' is not a file that {script} has written") from None
     robots, approaches, parameters = (list(dict.fromkeys(names)) for names in zip(*lines, strict=True))
     size = (3.0 * len(parameters), 2.2 * len(robots) + 0.4)
     figure, axes = pyplot.subplots(len(robots), len(parameters), figsize=size, layout="constrained", squeeze=False)
@@ -48,7 +51,7 @@ def plot_sweeps() -> None:
         axis = axes[robots.index(robot), parameters.index(parameter)]
         try:
             _draw(axis, of_seeds, approach, f"C{approaches.index(approach)}")
-        except (LookupError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise UserError(f"a sweep of {parameter} for {robot}_{approach} is not whole: {error!r}") from None
     for row, robot in zip(axes, robots, strict=True):
         row[0].annotate(robot, (-0.42, 0.5), xycoords="axes fraction", rotation=90, va="center", weight="bold")

@@ -48,7 +48,7 @@ def main() -> None:
     with cli.slow_imports():
         for num_envs in args.num_envs or [None]:
             options = dataclasses.replace(cli.options_of(args), num_envs=num_envs, set=changes)
-            sizes.append(task_registry.get_cfgs(args.task, options))
+            sizes.append(task_registry.get_new_cfgs(options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
         from legged_torque.benchmark.measure import MemoryMeter

@@ -29,16 +29,9 @@ from legged_torque.utils.devices import busy_cores_note, device_name, resolve_de
 from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
-from legged_torque.utils.runs import (
-    CONFIG_FILE,
-    find_checkpoint_of,
-    given_iterations,
-    load_config,
-    new_run_dir,
-    package_versions,
-)
+from legged_torque.utils.runs import CONFIG_FILE, given_iterations, new_run_dir, package_versions
 from legged_torque.utils.stopwatch import stopwatch
-from legged_torque.utils.task_registry import experiment_dir, num_iterations, print_notes, set_seed
+from legged_torque.utils.task_registry import experiment_dir, find_teachers, num_iterations, print_notes, set_seed
 from legged_torque.viewer.training_viewer import TrainingViewer
 
 if TYPE_CHECKING:
@@ -79,6 +72,7 @@ def main() -> None:
                 use_first_run(options)
             run = task_registry.load_run(options)
         env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
+        train_cfg.distillation.teachers = list(map(str, find_teachers(train_cfg, options.log_root)))
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or given_iterations(run.config)
         kept = run.config.get("processes")  # from a file
@@ -91,8 +85,6 @@ def main() -> None:
         options.task = options.task or DEFAULT_TASK
         with cli.slow_imports():
             env_cfg, train_cfg = new_settings(options)
-            if train_cfg.distillation.teachers:
-                env_cfg, train_cfg = settings_of_student(options, train_cfg)
         processes = min(distributed.usable_cores(), distributed.MAX_PROCESSES)
     on_cores = options.preset == CPU_PRESET and resolve_device(options.device) == "cpu" and learns_in_parts(train_cfg)
     if on_cores and distributed.use_cores(processes) and options.resume:
@@ -118,11 +110,11 @@ def main() -> None:
 
 def new_settings(options: Options) -> tuple[Any, Any]:
     """Return the settings of a task and its training; on a CPU, those of the preset for it unless another is given."""
-    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+    env_cfg, train_cfg = task_registry.get_new_cfgs(options)
     is_open = options.preset is None and CPU_PRESET in train_cfg.presets()
     if is_open and resolve_device(options.device) == "cpu":
         options.preset = CPU_PRESET
-        return task_registry.get_cfgs(options.task, options)
+        return task_registry.get_new_cfgs(options)
     return env_cfg, train_cfg
 
 
@@ -131,19 +123,6 @@ def learns_in_parts(train_cfg: Any) -> bool:
     from rsl_rl.utils import resolve_callable
 
     return hasattr(resolve_callable(train_cfg.algorithm.class_name), "broadcast_parameters")
-
-
-def settings_of_student(options: Options, train_cfg: Any) -> tuple[Any, Any]:
-    """Return the first teacher's settings of the task, as options change them, with teachers by their files."""
-    root, names = experiment_dir(train_cfg, options.log_root), train_cfg.distillation.teachers
-    files = [find_checkpoint_of(root, name).resolve() for name in names]
-    config = load_config(files[0].parent) | {"train": {}}
-    if "cpu" in (resolve_device(options.device), config.get("device")):  # which has fewer worlds than a GPU
-        with contextlib.suppress(KeyError, TypeError):  # of a broken file, of which get_cfgs says what is wrong
-            del config["env"]["env"]["num_envs"]
-    env_cfg, train_cfg = task_registry.get_cfgs(options.task, options, config)
-    train_cfg.distillation.teachers = list(map(str, files))
-    return env_cfg, train_cfg
 
 
 def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer) -> None:
@@ -155,19 +134,17 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     from legged_torque.envs.base.legged_robot import LeggedRobot
 
     is_first = distributed.rank() == 0
-    starts_pretrained = bool(train_cfg.pretraining.function) and not options.resume and is_first
-    if starts_pretrained:
-        from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
-
-        pretrained = pretrained_file(options.task, train_cfg, options.log_root)
-        find_pretrained(pretrained, options.task, env_cfg, train_cfg, resolve_device(options.device))
     env, _ = task_registry.make_env(options.task, options, env_cfg)
     stopwatch.lap("task")
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
         print_notes([standing_note(env)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
-    if starts_pretrained:
-        start_from(runner, pretrained)  # the other processes get the networks of the first one
+    if train_cfg.pretraining.function and not options.resume and is_first:  # from whom the others get their networks
+        from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
+
+        pretrained = pretrained_file(options.task, train_cfg, options.log_root)
+        find_pretrained(pretrained, options.task, env_cfg, train_cfg, env.device)
+        start_from(runner, pretrained)
     if is_first and isinstance(env, LeggedRobot):
         print_notes([export_note(env, runner.alg.policy())])
     runner.verbose = options.verbose

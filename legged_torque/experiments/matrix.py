@@ -10,6 +10,7 @@ from typing import Any
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.errors import UserError, check_names
@@ -152,6 +153,7 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     Tasks that ``task_files`` register are allowed; the files are imported.
     """
     from legged_torque.envs.base.asset import load_asset
+    from legged_torque.learning.distillation import check_student
 
     task_registry.import_files(task_files)
     matrix = replace(read_plan(file), task_files=tuple(str(Path(name).resolve()) for name in task_files))
@@ -164,12 +166,16 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     for cell in matrix.cells(Path()):
         words, options = set_words(matrix.train), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
         options.preset, options.ranges, options.set = matrix.preset, matrix.ranges, words
-        env_cfg, _ = task_registry.get_cfgs(cell.task, options)
+        options.task, options.experiment_name = cell.task, cell.name  # teachers' names are those of its runs
+        env_cfg, train_cfg = task_registry.get_new_cfgs(options)
         check_env_cfg(env_cfg)
+        if train_cfg.algorithm.class_name == DISTILLATION:
+            learner = train_cfg.distillation
+            check_student(learner.teachers, train_cfg.runner.num_steps_per_env, learner.gradient_length)
         check_names("perturbation", cell.evaluated_in, env_cfg.perturbations())
         for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
             options.set = [*words, *set_words(settings)]
-            check_env_cfg(changed := task_registry.get_cfgs(cell.task, options)[0])
+            check_env_cfg(changed := task_registry.get_new_cfgs(options)[0])
             if evaluation.startswith(SWEEP):
                 draw_only(changed, evaluation.removeprefix(SWEEP))
         of_tasks[cell.task] = env_cfg

@@ -88,17 +88,10 @@ class Distillation(algorithms.Distillation):
 
     def allocate(self) -> None:
         """Load the teachers; a UserError if none is given, one does not fit, or settings fit no rollout of the task."""
-        steps, length = self.storage.num_transitions_per_env, len(self._steps)
-        if steps % length:
-            given = f"distillation.gradient_length must divide runner.num_steps_per_env, {steps}"
-            raise UserError(f"{given}, not be {length}")
+        check_student(self._files, self.storage.num_transitions_per_env, len(self._steps))
         if self.num_mini_batches > self._env.num_envs:
             given = f"distillation.num_mini_batches is {self.num_mini_batches}"
             raise UserError(f"{given}, more than the {self._env.num_envs} worlds")
-        if not self._files:
-            raise UserError(
-                "a student needs teachers: --set 'distillation.teachers=[RUN]' names the run of a trained one"
-            )
         # the first one last: the counters of the task, and so its curricula, become those of the last that is loaded
         members = [Teacher(file, self._env, self._task_name) for file in reversed(self._files)]
         self.teacher = Teachers(members[::-1], self._env)
@@ -248,6 +241,15 @@ class Distillation(algorithms.Distillation):
         self.student.reset(hidden_state=state["student"])
         for policy, memory in zip(self.teacher.recurrent(), state["teachers"], strict=True):
             policy.memory = memory
+
+
+def check_student(teachers: list[str], steps: int, length: int) -> None:
+    """Raise a UserError without teachers, or if a rollout's steps are no multiple of the length of a gradient step."""
+    if steps % length:
+        given = f"distillation.gradient_length must divide runner.num_steps_per_env, {steps}"
+        raise UserError(f"{given}, not be {length}")
+    if not teachers:
+        raise UserError("a student needs teachers: --set 'distillation.teachers=[RUN]' names the run of a trained one")
 
 
 def _parts(state: HiddenState) -> tuple[Tensor, ...]:

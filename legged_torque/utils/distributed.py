@@ -10,9 +10,10 @@ import signal
 import socket
 import subprocess
 import sys
+from multiprocessing.pool import ThreadPool
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import LOST_PROCESS, UserError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,7 +27,9 @@ ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)}, 0, 0, 0)  # PR_SET_PDEATHSIG o
 os.execvp(sys.argv[1], sys.argv[1:])
 """
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
+_POLL = 0.2  # seconds between looks at the processes that this one waits for
 _WORD = 16  # bytes: tensors that travel together begin at its multiples, as the widest numbers (complex128) must
+_started: list[subprocess.Popen] = []  # the others, in the process that has started them
 _shared: SharedMean | None = None  # of processes that this module has started, once they have found each other
 
 
@@ -95,7 +98,7 @@ def use_cores(num_processes: int) -> bool:
     torch.set_num_threads(1)
     command = ending_with_parent([sys.executable, *sys.orig_argv[1:]])
     for number in map(str, range(1, num_processes)):
-        subprocess.Popen(command, env={**os.environ, "RANK": number, "LOCAL_RANK": number})
+        _started.append(subprocess.Popen(command, env={**os.environ, "RANK": number, "LOCAL_RANK": number}))
     return True
 
 
@@ -108,12 +111,31 @@ def _variable(name: str, lowest: int) -> int:
 
 
 def join(device: str) -> None:
-    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N")."""
+    """Join the other processes, if that is not done yet, to exchange tensors on a device ("cpu", "cuda:N").
+
+    A UserError if they do not find each other, or one that this process has started ends before.
+    """
+    import torch
+
+    if torch.distributed.is_initialized():
+        return
+    if not _started:
+        _meet(device)
+        return
+    with ThreadPool(1) as pool:  # whose thread does not hear of a process that has ended
+        meeting = pool.apply_async(_meet, [device])
+        while not meeting.ready():
+            meeting.wait(_POLL)
+            if any(process.poll() is not None for process in _started):
+                raise UserError(LOST_PROCESS)
+        meeting.get()
+
+
+def _meet(device: str) -> None:
+    """Wait for the other processes, and connect to them; a UserError if they are not found."""
     import torch
 
     global _shared
-    if torch.distributed.is_initialized():
-        return
     try:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
         from legged_torque.utils.shared_mean import SharedMean, can_share

@@ -85,7 +85,8 @@ def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
         pattern: Where runs are in the folder: "*/*" in that of all experiments.
     """
     if load_run and Path(load_run).is_dir():
-        return Path(load_run)
+        folder = Path(load_run)
+        return folder if folder.name.strip(".") else folder.resolve()  # "." and ".." are no names of runs
     runs = sorted((path for path in root.glob(pattern) if checkpoint_numbers(path)), key=lambda path: (path.name, path))
     if not runs:
         raise UserError(f"there is no run with a checkpoint in '{root}'; train first")

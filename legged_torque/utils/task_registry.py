@@ -150,6 +150,33 @@ class TaskRegistry:
             env_cfg.env.num_envs = env_cfg.env.num_envs_cpu
         return env_cfg, train_cfg
 
+    def get_new_cfgs(self, options: Options) -> tuple[Any, Any]:
+        """Return the settings of a task and a training that begins, as the options change them.
+
+        Those of a student's task are the first teacher's, also how long a control step is. A UserError if there is no
+        such teacher, or one is of another task.
+        """
+        env_cfg, train_cfg = self.get_cfgs(options.task, options)
+        files = find_teachers(train_cfg, options.log_root)
+        if not files:
+            return env_cfg, train_cfg
+        for file in reversed(files):  # the first one last
+            config = runs.load_config(file.parent)
+            if config["task"] != options.task:
+                raise UserError(f"the run '{file.parent}' is of task '{config['task']}', not '{options.task}'")
+        if "cpu" in (resolve_device(options.device), config.get("device")):  # which has fewer worlds than a GPU
+            with contextlib.suppress(KeyError, TypeError):  # of a broken file, of which get_cfgs says what is wrong
+                del config["env"]["env"]["num_envs"]
+        config["train"] = {}
+        known = (env_cfg, self.get_cfgs(options.task, Options(device=options.device), config)[0])
+        own, teachers = (cfg.sim.dt * cfg.control.decimation for cfg in known)
+        train_cfg.set_clock(own / teachers)
+        evaluation = {"num_samples": train_cfg.evaluation.num_samples}
+        config["train"] = {"evaluation": evaluation, "pretraining": {"function": ""}}  # it does not start from one
+        env_cfg, train_cfg = self.get_cfgs(options.task, options, config)
+        train_cfg.distillation.teachers = list(map(str, files))
+        return env_cfg, train_cfg
+
     def make_env(self, name: str, args: Options | None = None, env_cfg: Any | None = None) -> tuple[VecEnv, Any]:
         """Create a task on the device of ``args``; return it and its settings.
 
@@ -314,6 +341,12 @@ def print_notes(notes: Iterable[str]) -> None:
 def experiment_dir(train_cfg: Any, log_root: str | None = None) -> Path:
     """Return the folder that holds the runs of an experiment; the default of ``log_root`` is :data:`LOGS`."""
     return Path(log_root or LOGS) / train_cfg.runner.experiment_name
+
+
+def find_teachers(train_cfg: Any, log_root: str | None = None) -> list[Path]:
+    """Return the checkpoints of a student's teachers, which are given by files, or by runs of its experiment."""
+    root = experiment_dir(train_cfg, log_root)
+    return [runs.find_checkpoint_of(root, name).resolve() for name in train_cfg.distillation.teachers]
 
 
 def num_iterations(env: VecEnv, train_cfg: Any, done: int = 0) -> int:

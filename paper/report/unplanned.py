@@ -10,6 +10,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.experiments.matrix import SETTINGS_FILE, Cell, Matrix
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import without_machine
 from legged_torque.utils.options import Options
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
@@ -19,7 +20,8 @@ PUSHES = ("push_velocity", "push_probability")
 """Settings without effect where robots are not pushed."""
 NEUTRAL = {"add": [0.0, 0.0], "scale": [1.0, 1.0], "scale_per_joint": [1.0, 1.0]}
 """Ranges of a random parameter that do not change it, by operation."""
-FREE = ("seed", "evaluation.", "runner.experiment_name", "runner.save_interval", "runner.total_steps", "runner.logger")
+FREE: tuple[str, ...] = ("seed", "evaluation.", "distillation.teachers")
+FREE += ("runner.experiment_name", "runner.save_interval", "runner.total_steps", "runner.logger")
 """Settings that do not change what is learned, or may differ between the runs of one training."""
 
 Trainings = dict[Cell, list[Path]]
@@ -62,7 +64,8 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
 def differing(settings: Mapping[str, Any], others: list[dict[str, Any]]) -> list[str]:
     """Return "path=value" of each setting, except :data:`FREE` ones, that differs in one of the ``others``."""
     paths = [path for path in settings if not path.startswith(FREE)]
-    return [f"{path}={settings[path]}" for path in paths if any(other.get(path) != settings[path] for other in others)]
+    own = [path for path in paths if any(other.get(path) != settings[path] for other in others)]
+    return [f"{path}={without_machine(settings[path])}" for path in own]
 
 
 def plan_of(trainings: Trainings) -> Matrix:

@@ -15,8 +15,11 @@ import torch
 import yaml
 from support.experiments import SMALL, experiment_here, wait_for, write
 from support.scripts import ROOT, assert_told_in_one_line, contents
+from support.settings import error_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged_torque.experiments.matrix import read_matrix
+from legged_torque.utils.policies import POLICIES_DIR
 from legged_torque.utils.runs import checkpoint_numbers
 
 TABLES = yaml.safe_load(Path(__file__).with_name("mistakes.yaml").read_text("utf-8"))
@@ -133,6 +136,22 @@ def test_mistakes_in_the_file(change, message, tmp_path):
     result = experiment_here(file, f"--out={tmp_path / 'out'}", "--device=cpu", tmp_path=tmp_path)
     assert_told_in_one_line(result, message)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def test_teachers_in_the_file(tmp_path):
+    """What training would refuse is refused before: no teacher, none that exists, of another task, and no rollout."""
+    teacher, length = str(POLICIES_DIR / "a1" / "position"), "distillation.gradient_length"
+    fitting = {"tasks": ["a1_position"], "preset": "student"}
+    for changes, teachers, message in (
+        ({}, [], "a student needs teachers"),
+        ({}, ["nobody"], "there is no run with a checkpoint in"),
+        ({"tasks": SMALL["tasks"]}, [teacher], "is of task 'a1_position', not 'a1_torque'"),
+        ({"train": {length: 7}}, [teacher], f"{length} must divide runner.num_steps_per_env, 24, not be 7"),
+        ({}, [teacher], ""),
+    ):
+        train = {"distillation.teachers": teachers, **changes.get("train", {})}
+        file = write(tmp_path / "matrix.yaml", SMALL | fitting | changes | {"train": train})
+        assert message in (error_of(read_matrix, file) if message else read_matrix(file).preset)
 
 
 @pytest.mark.parametrize(("words", "message"), TABLES["command line"])

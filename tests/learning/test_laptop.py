@@ -11,7 +11,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
-from support.scripts import COMMAND, PATHS, run_here
+from support.scripts import COMMAND, PATHS, assert_told_in_one_line, run_here
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum
@@ -67,6 +67,16 @@ def test_the_others_end_with_the_first(tmp_path):
         "if not d.use_cores(d.usable_cores()):\n    print('started', flush=True)\ntime.sleep(60)\n"
     )
     assert end_first_of_two(signal.SIGKILL, "started", tmp_path / "both.py")[0] == -signal.SIGKILL
+
+
+def test_one_ends_before_all_have_joined(tmp_path):
+    """The first process does not wait for it."""
+    text = "from legged_torque.utils import cli, distributed\n"
+    text += "cli.run_script(lambda: distributed.use_cores(2) and distributed.join('cpu'))\n"
+    (tmp_path / "both.py").write_text(text)
+    how = {"env": os.environ | PATHS, "text": True, "capture_output": True, "timeout": 60}
+    done = subprocess.run([*COMMAND, tmp_path / "both.py"], **how)
+    assert_told_in_one_line((done.returncode, done.stdout, done.stderr), "another process of this training has ended")
 
 
 @pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])

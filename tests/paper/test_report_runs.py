@@ -84,14 +84,19 @@ def test_report_on_runs(logs):
 
 
 def test_runs_with_other_settings(tmp_path):
-    """Runs of one task and seed that differ in settings are two, named by these; a resumed one with them stays one."""
+    """Runs of one task and seed that differ in settings are two, named by these; a resumed one with them stays one.
+
+    Names have no folders of the machine. Students of other teachers are not other trainings.
+    """
     for day, scale, lines in ((1, -1.0, whole_run(0.5)[:3]), (2, -2.0, whole_run(0.6)), (3, -1.0, whole_run(0.7)[3:])):
         config = settings("mine", 1, "low")
         config["env"]["rewards"]["scales"]["torques"] = scale
+        config["env"]["asset"]["file"] = f"/home/me/robot{scale}.xml"
+        config["train"]["distillation"] = {"teachers": [f"/home/me/run{day}/model_1.pt"]}
         config["train"]["evaluation"]["interval"] = day  # this does not change what is learned
         write_run(tmp_path / f"2026-01-0{day}_00-00-00", lines, config)
     experiment = read_experiment(tmp_path)
-    names = [f"mine rewards.scales.torques={scale}" for scale in (-1.0, -2.0)]
+    names = [f"mine asset.file=robot{scale}.xml rewards.scales.torques={scale}" for scale in (-1.0, -2.0)]
     assert experiment.plan.tasks == names
     first, second = (experiment.runs_of(name, "low")[0] for name in names)
     assert len(first.rows) == len(second.rows) == 5 and len(first.configs) == 2

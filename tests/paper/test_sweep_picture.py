@@ -40,7 +40,15 @@ def test_figure(files):
 
 
 def test_mistakes(files):
-    """A sweep without numbers is named."""
-    result = run_here("plot.py", "sweeps", "one.json", "broken.json", "--out=figure.svg", root=files)
-    assert_told_in_one_line(result, "a sweep of motor_strength for go2_position is not whole")
+    """A sweep without numbers is named, and so is a file that is none."""
+    told = {"broken": "a sweep of motor_strength for go2_position is not whole"}
+    parts = [{"from": 0.0, "to": 1.0, "fell": 1}]
+    whole = {"parameter": "x", "unit": "", "parts": parts}
+    for number, (task, content) in enumerate([(5, whole), ("a", [1]), ("a", whole | {"parameter": []}), ("a", whole)]):
+        (files / f"{number}.json").write_text(json.dumps({"task": task, "sweep": content}))
+        told[str(number)] = f"'{number}.json' is not a file that evaluate.py --sweep has written"
+    told["3"] = "a sweep of x for a_a is not whole"
+    for name, message in told.items():
+        result = run_here("plot.py", "sweeps", "one.json", f"{name}.json", "--out=figure.svg", root=files)
+        assert_told_in_one_line(result, message)
     assert not (files / "figure.svg").exists()

@@ -87,6 +87,22 @@ def test_resume_with_other_worlds_or_more_steps(tmp_path):
     assert resumed(run, 1, "--set=runner.total_steps=24")[1:] == (3, 24)
 
 
+def test_teachers_by_their_names(run):
+    """They are found in a training, when it is resumed, which keeps whole paths, and in a benchmark."""
+    root, config = run.parents[2], run / "config.yaml"
+    config.write_text(config.read_text().replace("action_scale: 0.25", "action_scale: 0.2"))
+    new = ["--preset=student", "--set=distillation.gradient_length=4", "--set=distillation.num_mini_batches=2"]
+    words = {"train.py": [*SMALL, *new], "benchmark.py": ["--num_envs=2", "--rounds=1", *SMALL[:2], *new, SMALL[3]]}
+    for script in words:
+        teachers = f"--set=distillation.teachers=[{run.name}]"
+        assert run_here(script, *words[script], teachers, root=root)[::2] == (0, "")
+    for number, teacher in enumerate((run.name, run.relative_to(root)), 3):
+        resume = ["--resume", f"--max_iterations={number}", f"--set=distillation.teachers=[{teacher}]"]
+        assert run_here("train.py", *SMALL[:2], *resume, root=root)[::2] == (0, "")
+        settings = yaml.safe_load((max(run.parent.iterdir()) / "config.yaml").read_text())
+        assert settings["train"]["distillation"]["teachers"] == [str(run / "model_1.pt")]
+
+
 def test_nobody_reads_on(tmp_path):
     """Output that goes into ``| head`` ends a script without a traceback."""
     process = start("train.py", "--list", root=tmp_path)

@@ -1,6 +1,7 @@
 """The registry of tasks, and settings that inherit."""
 
 import copy
+import zipfile
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.utils.config import BaseConfig, to_dict, update_from_dict
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.options import Options
+from legged_torque.utils.runs import save_config
 from legged_torque.utils.task_registry import TaskRegistry
 
 
@@ -115,6 +117,28 @@ def test_tuples_are_lists():
     assert cfg.limits == [-0.5, 1.0]
     update_from_dict(cfg, {"limits": [0.0, 2.0]})
     assert cfg.limits == [0.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("task", "decimation", "words", "samples"),
+    [
+        ("a1_position", 2, [], 64_000),
+        ("a1_position", 2, ["--policy_hz=100"], 64_000),
+        ("a1_position", 2, ["--set=evaluation.num_samples=20"], 20),
+        ("a1_torque_gravity", 4, [], 32_000),
+    ],
+)
+def test_settings_of_a_student(tmp_path, task, decimation, words, samples):
+    """Evaluations take as long as at 50 Hz, where a teacher's policy acts at 100 Hz; none starts from pre-training."""
+    env_cfg, _ = task_registry.get_cfgs(task)
+    env_cfg.control.decimation = decimation
+    save_config(tmp_path, {"task": task, "env": to_dict(env_cfg), "train": {}})
+    zipfile.ZipFile(tmp_path / "model_2.pt", "w").close()
+    teachers = [f"--task={task}", "--preset=student", f"--set=distillation.teachers=[{tmp_path}]"]
+    env_cfg, train_cfg = task_registry.get_new_cfgs(parse(*teachers, *words))
+    assert (env_cfg.control.decimation, train_cfg.evaluation.num_samples) == (decimation, samples)
+    assert train_cfg.distillation.teachers == [str(tmp_path / "model_2.pt")]
+    assert train_cfg.pretraining.function == ""
 
 
 def test_names_of_a_users_own_task():

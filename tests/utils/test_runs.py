@@ -31,11 +31,15 @@ def log_root(tmp_path):
     return tmp_path
 
 
-def test_find_run(log_root):
-    """The newest run that has a checkpoint, one by its name, or one by its path."""
+def test_find_run(log_root, monkeypatch):
+    """The newest run that has a checkpoint, one by its name, or one by its path, which gives its name even if short."""
     assert runs.find_run(log_root, None) == log_root / "2026-01-02_00-00-00_wide"
     assert runs.find_run(log_root, "2026-01-01_00-00-00") == log_root / "2026-01-01_00-00-00"
     assert runs.find_run(log_root, f"{log_root}/2026-01-03_00-00-00") == log_root / "2026-01-03_00-00-00"
+    (log_root / "2026-01-01_00-00-00" / "exported_2").mkdir()
+    for folder, short in (("2026-01-03_00-00-00", "."), ("2026-01-01_00-00-00/exported_2", "..")):
+        monkeypatch.chdir(log_root / folder)
+        assert runs.find_run(log_root, short).name == folder.split("/")[0]
 
 
 def test_find_run_that_does_not_exist(log_root):
