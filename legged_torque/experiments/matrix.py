@@ -166,7 +166,7 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     for cell in matrix.cells(Path()):
         words, options = set_words(matrix.train), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
         options.preset, options.ranges, options.set = matrix.preset, matrix.ranges, words
-        options.task, options.experiment_name = cell.task, cell.name  # teachers' names are those of its runs
+        options.task, options.experiment_name = cell.task, cell.name  # which is where teachers are sought
         env_cfg, train_cfg = task_registry.get_new_cfgs(options)
         check_env_cfg(env_cfg)
         if train_cfg.algorithm.class_name == DISTILLATION:

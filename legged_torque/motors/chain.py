@@ -14,7 +14,7 @@ from legged_torque.utils.errors import UserError, check_names
 
 
 class MotorChain:
-    """Links in the order of ``motors.chain``: first those that act on actions, then those that act on torques.
+    """Links in the order of ``motors.chain``: first one that acts on actions, if any, then those that act on torques.
 
     Between them the control law computes the desired torques, which are multiplied by the strength of the motors.
 

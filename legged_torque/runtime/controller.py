@@ -109,7 +109,8 @@ class Controller:
     def _not_standing(self) -> str:
         """Return why a policy must not take over."""
         if self.state is None or self.mode != Mode.STAND or self._now - self._since < self.brakes.stand_up:
-            return f"the policy takes over from a robot that stands; it is in {self.mode.value}"
+            does = "stands up" if self.mode == Mode.STAND else f"is in {self.mode.value}"
+            return f"the policy takes over from a robot that stands; it still {does}"
         off, allowed = np.abs(self.state.joint_positions - self._nominal_pose), self.brakes.max_pose_error
         worst = f"{self.joints.names[off.argmax()]} is {off.max():.2f} rad from the nominal pose"
         return f"{worst}, at most {allowed:g} are allowed" if off.max() > allowed else ""
@@ -192,7 +193,8 @@ class Controller:
         if late > allowed + 1e-6:
             return f"all deadlines of {1e3 * late:.0f} ms were missed"
         lost, allowed = 1e3 * self._behind, 1e3 * self.brakes.max_behind
-        return f"late ticks have cost {lost:.1f} ms, at most {allowed:.0f} are allowed" if lost > allowed else ""
+        problem = f"late ticks have cost {lost:.1f} ms, at most {allowed:.0f} are allowed: try a lower --rate"
+        return problem if lost > allowed else ""
 
     def _at_rest(self) -> MotorCommand:
         """Return the command of a robot that neither stands nor walks."""

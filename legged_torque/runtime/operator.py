@@ -83,8 +83,9 @@ class Unattended(Operator):
         following = {Mode.DAMPING: Mode.STAND, Mode.STAND: Mode.POLICY}.get(self._mode)
         if following and self._controller.mode != self._mode:
             self._mode = Mode.PASSIVE  # after which nothing follows
-        elif following and not self._controller.request(following):
-            self._mode = following
+        elif following:
+            self.ask(following)
+            self._mode = self._mode if self.note else following
 
 
 class Keyboard(Operator):

@@ -90,6 +90,8 @@ class Randomization:
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
         num_draws = 1  # number 0 decides what is kept
+        for parameter in parameters:
+            check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
         listed = {each.same_draw_as or each.name: each for each in parameters[::-1]}
         listed |= {each.same_draw_as or each.name: each for each in parameters[::-1] if each.is_drawn}
         for parameter in parameters:
@@ -134,7 +136,6 @@ class Randomization:
     def _field(self, parameter: RandomParameter, model_field: Callable[[str, Sequence[int]], Tensor]) -> Tensor:
         """Return and keep the tensor of a parameter; a UserError unless the kernel can write to its addresses."""
         name, field = parameter.name, parameter.field
-        check_value(f"random parameter '{name}'", parameter.draw, Draw)
         if isinstance(field, str):
             name, field = field, model_field(field, parameter.columns).flatten(1)
         kind, shape = field.dtype, tuple(field.shape)

@@ -13,7 +13,7 @@ import sys
 from multiprocessing.pool import ThreadPool
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.utils.errors import LOST_PROCESS, UserError
+from legged_torque.utils.errors import UserError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -127,7 +127,7 @@ def join(device: str) -> None:
         while not meeting.ready():
             meeting.wait(_POLL)
             if any(process.poll() is not None for process in _started):
-                raise UserError(LOST_PROCESS)
+                raise UserError("another process of this training has ended before it began")
         meeting.get()
 
 

@@ -50,12 +50,18 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
             problems.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
     if not keys:
         raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
+    names: dict[str, str] = {}  # of trainings without paths of the machine, unless two have the same
     runs: dict[tuple[str, str, int], list[Path]] = {}
     for run, (task, environment, seed) in keys.items():
         others = [configs[other] for other, key in keys.items() if key[:2] == (task, environment)]
-        runs.setdefault((" ".join([task, *differing(configs[run], others)]), environment, seed), []).append(run)
+        changes = differing(configs[run], others)
+        whole, short = (" ".join([task, *part]) for part in (changes, without_machine(changes)))
+        name = names.setdefault(whole, whole if short in names.values() else short)
+        runs.setdefault((name, environment, seed), []).append(run)
     trainings: Trainings = {}
     for key, parts in sorted(runs.items()):
+        if len({str(configs[part].get("distillation.teachers")) for part in parts}) > 1:
+            problems.append(f"{key[0]}, seed {key[2]}, has runs of other teachers; of two that began at 0, one counts")
         also = configs[parts[-1]].get("evaluation.also") or ()
         trainings[Cell(parts[-1], *key, tuple(dict.fromkeys([key[1], *map(str, also)])))] = parts
     return trainings
@@ -64,8 +70,7 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
 def differing(settings: Mapping[str, Any], others: list[dict[str, Any]]) -> list[str]:
     """Return "path=value" of each setting, except :data:`FREE` ones, that differs in one of the ``others``."""
     paths = [path for path in settings if not path.startswith(FREE)]
-    own = [path for path in paths if any(other.get(path) != settings[path] for other in others)]
-    return [f"{path}={without_machine(settings[path])}" for path in own]
+    return [f"{path}={settings[path]}" for path in paths if any(other.get(path) != settings[path] for other in others)]
 
 
 def plan_of(trainings: Trainings) -> Matrix:

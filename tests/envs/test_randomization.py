@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.settings import error_of
 
 from legged_torque.sim.randomization import Randomization, RandomParameter
 from legged_torque.utils.errors import UserError
@@ -268,6 +269,9 @@ def test_tensors_that_the_kernel_cannot_write():
     """Numbers of another type are refused at once, a tensor without a row per world when it is drawn."""
     with pytest.raises(UserError, match="'wide' must be float32"):
         Randomization([RandomParameter("wide", torch.zeros(3, 2, dtype=torch.float64), [0], {})], {}.get, 3, "cpu")
+    for ranges in ({"scale": [0.8]}, {"scale": 0.8}, {"scale": ["a", 2]}, [1, 2]):
+        own = RandomParameter("own", torch.ones(3, 2), [0], ranges)
+        assert "random parameter 'own'" in error_of(Randomization, [own], {}.get, 3, "cpu")
     shared = Randomization([RandomParameter("shared", torch.ones(1, 2), [0], {})], {}.get, 3, "cpu")
     with pytest.raises(UserError, match="without a row per world: shared"):
         shared.draw(torch.ones(3, dtype=torch.bool))

@@ -98,6 +98,9 @@ def test_both_numbers_of_contacts(changed, make_task):
     stiffness, damping = -task.sim.field("geom_solref")[:, 0].T
     torch.testing.assert_close(damping, 72.0 + (stiffness - 900.0) * 0.08)
     assert Sweep(task, "contact_stiffness").edges[0] == 900.0
+    one = make_task("a1_position", 2, **{"domain_rand.randomize_parameters": True, "domain_rand.contact_stiffness": {}})
+    assert Sweep(one, "contact_damping").edges[0] == 72.0
+    assert error_of(Sweep, one, "contact_stiffness").endswith("that of contact_damping: sweep contact_damping")
 
 
 def test_links_that_do_not_exist(make_task):

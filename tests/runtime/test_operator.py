@@ -140,10 +140,14 @@ def test_gamepad(robot, tmp_path):
 
 @pytest.mark.parametrize("reached", [Mode.STAND, Mode.POLICY])
 def test_unattended(robot, reached):
-    """A robot that another operator has damped stays so."""
-    unattended = operator.Unattended(robot.controller)
+    """A robot that another operator has damped stays so; why the policy waits is noted."""
+    unattended, notes = operator.Unattended(robot.controller), set()
+    robot.controller.brakes.stand_up = 0.03  # seconds, of which each look takes 0.02
     while does(robot)[0] != reached:
         unattended.look()
+        notes.add(unattended.note)
+    why = "no policy now: the policy takes over from a robot that stands; it still stands up"
+    assert (why in notes) == (reached == Mode.POLICY) and not unattended.note
     for mode in (Mode.DAMPING, Mode.STAND):
         robot.controller.request(mode)
         for _ in range(2):

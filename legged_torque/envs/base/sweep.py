@@ -34,11 +34,11 @@ class Sweep:
         """Start with empty sums; a UserError if the parameter has one value only, or several numbers of its own."""
         setting = DELAYS.get(name, f"domain_rand.{name}")
         kinds = (task.events.parameters, task.events.initial_state)
-        other = next((each.same_draw_as for kind in kinds for each in kind.parameters if each.name == name), None)
-        if other:
-            raise UserError(f"{name} has no draw of its own, but that of {other}: sweep {other}")
         drawn = next((kind for kind in kinds if name in kind.sizes), None)
         if drawn is None:
+            draws = {each.name: each.same_draw_as or each.name for kind in kinds for each in kind.parameters}
+            for other in (listed for kind in kinds for listed in kind.sizes if draws[listed] == draws.get(name)):
+                raise UserError(f"{name} has no draw of its own, but that of {other}: sweep {other}")
             raise UserError(f"{name} is always 0: give {setting} a range with --set")
         if drawn.sizes[name] > 1:
             raise UserError(f"--sweep takes parameters with one number per world; {name} has {drawn.sizes[name]}")

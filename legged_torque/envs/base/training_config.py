@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 CODE_NAMES = ("class_name", "function", "_func")
 """Ends of the names of settings that name a class or a function, ``"module:Class"`` or a name in rsl_rl."""
 PPO = "legged_torque.learning.ppo:OnDevicePPO"
-SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.")  # of learners
+SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.", "pretraining.file")  # of learners
 READ = {
-    PPO: ("algorithm.", "actor.", "critic."),
+    PPO: ("algorithm.", "actor.", "critic.", "pretraining.file"),
     FLASHSAC: (
         "flashsac.",
         *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision", "symmetry_cfg.")),
