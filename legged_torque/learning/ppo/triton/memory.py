@@ -181,7 +181,8 @@ class Memory:
                     for first in range(0, aligned(source.size), NARROW_TILE):
                         read = [self.place(layer.target), layer.target.block.width, aligned(layer.target.size)]
                         read += [self._weight_places[layer] + offset + first, layer.input_width]
-                        written = [self.place(source) + first, source.block.width, self._sum_columns[source] + first]
+                        sizes = [aligned(source.size) - first, self._sum_columns[source] + first]
+                        written = [self.place(source) + first, source.block.width, *sizes]
                         adds = source.size - first if source in there else 0
                         tiles.append([*read, *written, adds, int(source.elu and last[source] is layer)])
                     offset += aligned(source.size)

@@ -62,19 +62,20 @@ def input_gradient(
 ):  # fmt: skip
     """Write the gradient of one tile of what a layer reads, g W times the slope of the ELU that made it, and its sum.
 
-    The sum over the samples is the gradient of biases. ``TILE`` is 64, so that the result fills it. Table: 0 place and
-    1 stride of g, 2 its columns, 3 place and 4 stride of W, 5 place and 6 stride of the result, 7 column of the sums,
-    8 to how many columns of what is there the result is added, 9 whether an ELU made what the layer reads.
+    The sum over the samples is the gradient of biases. Table: 0 place and 1 stride of g, 2 its columns, 3 place and
+    4 stride of W, 5 place and 6 stride of the result, 7 its columns, 8 column of the sums, 9 to how many columns of
+    what is there the result is added, 10 whether an ELU made what the layer reads.
     """
     row = table + tl.program_id(0) * COLUMNS
     first = tl.program_id(1).to(tl.int64) * SAMPLES
     stride, w_stride, size = entry(row, 1).to(tl.int32), entry(row, 4).to(tl.int32), entry(row, 2).to(tl.int32)
     g = gradients + entry(row, 0) + first * stride
     w = weights + entry(row, 3)
-    result_stride = entry(row, 6).to(tl.int32)
+    result_stride, width = entry(row, 6).to(tl.int32), entry(row, 7).to(tl.int32)
     place = entry(row, 5) + first * result_stride
-    column, adds, has_elu = tl.load(row + 7), tl.load(row + 8), tl.load(row + 9)
+    column, adds, has_elu = tl.load(row + 8), tl.load(row + 9), tl.load(row + 10)
     samples, columns, terms = tl.arange(0, SAMPLES), tl.arange(0, TILE), tl.arange(0, STEP)
+    kept = (columns < width)[None, :]
     from_g = samples[:, None] * stride + terms[None, :]
     from_w = terms[:, None] * w_stride + columns[None, :]
     total = tl.zeros((SAMPLES, TILE), tl.float32)
@@ -84,13 +85,14 @@ def input_gradient(
         w += STEP * w_stride
     here = samples[:, None] * result_stride + columns[None, :]
     if adds != 0:
-        there = (columns < adds)[None, :]  # not to the zeros behind: NaN, once it is there, would stay
+        there = kept & (columns < adds)[None, :]  # not to the zeros behind: NaN, once it is there, would stay
         total += tl.load(gradients + place + here, mask=there, other=0.0).to(tl.float32)
     if has_elu != 0:
-        value = tl.load(values + place + here).to(tl.float32)
+        value = tl.load(values + place + here, mask=kept, other=0.0).to(tl.float32)
         total = tl.where(value > 0.0, total, total * (value + 1.0))
-    tl.store(gradients + place + here, total.to(gradients.dtype.element_ty))
-    tl.store(sums + tl.program_id(1).to(tl.int64) * sums_stride + column + columns, tl.sum(total, 0))
+    tl.store(gradients + place + here, total.to(gradients.dtype.element_ty), mask=kept)
+    out = sums + tl.program_id(1).to(tl.int64) * sums_stride + column + columns
+    tl.store(out, tl.sum(total, 0), mask=columns < width)
 
 
 @triton.jit
