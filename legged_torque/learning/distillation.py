@@ -27,7 +27,7 @@ from legged_torque.utils.runs import checkpoint_number, find_checkpoint_of
 SAME = ["asset.file", "control.", "init_state.", LAW, "motors.drive.", "motors.muscle.", "normalization.", "sim.dt"]
 SAME += ["terrain.measured_points_"]
 """Beginnings of the paths of settings in which a teacher's run must agree: they say what actions and numbers mean."""
-LEAST_WEIGHT = 0.1  # of actions without effect, as of a PD part that has faded: policies observe their last actions
+LEAST_WEIGHT = 0.01  # of actions without effect, as of a PD part that has faded: policies observe their last actions
 DISTRIBUTION = "legged_torque.learning.distribution:GaussianDistribution"
 
 
