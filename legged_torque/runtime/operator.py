@@ -82,7 +82,7 @@ class Unattended(Operator):
         """Ask for the next mode, until one is not as it was left."""
         following = {Mode.DAMPING: Mode.STAND, Mode.STAND: Mode.POLICY}.get(self._mode)
         if following and self._controller.mode != self._mode:
-            self._mode = Mode.PASSIVE  # after which nothing follows
+            self._mode, self.note = Mode.PASSIVE, ""  # after which nothing follows
         elif following:
             self.ask(following)
             self._mode = self._mode if self.note else following
