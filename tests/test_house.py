@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2072,
     "paper": 3236,
     "tools": 1506,
-    "tests": 25898,
+    "tests": 25901,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 32_743  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
