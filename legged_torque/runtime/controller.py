@@ -109,8 +109,8 @@ class Controller:
     def _not_standing(self) -> str:
         """Return why a policy must not take over."""
         if self.state is None or self.mode != Mode.STAND or self._now - self._since < self.brakes.stand_up:
-            does = "stands up" if self.mode == Mode.STAND else f"is in {self.mode.value}"
-            return f"the policy takes over from a robot that stands; it still {does}"
+            when = f"once the robot stands, {self.brakes.stand_up:g} s after it was told to"
+            return f"the policy takes over {when}; it is in {self.mode.value}"
         off, allowed = np.abs(self.state.joint_positions - self._nominal_pose), self.brakes.max_pose_error
         worst = f"{self.joints.names[off.argmax()]} is {off.max():.2f} rad from the nominal pose"
         return f"{worst}, at most {allowed:g} are allowed" if off.max() > allowed else ""

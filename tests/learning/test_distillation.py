@@ -91,7 +91,7 @@ def roll_out(alg):
 
 
 def weighted(errors):
-    """The mean square of errors of actions by their weights; those without effect count a tenth."""
+    """The mean square of errors of actions by their weights; those without effect count a hundredth."""
     weights = np.maximum(WEIGHTS, 0.01)
     return (errors.square().mean(dim=0) * torch.from_numpy(weights).float()).sum() / weights.sum()
 

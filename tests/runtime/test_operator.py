@@ -146,7 +146,7 @@ def test_unattended(robot, reached):
     while does(robot)[0] != reached:
         unattended.look()
         notes.add(unattended.note)
-    why = "no policy now: the policy takes over from a robot that stands; it still stands up"
+    why = "no policy now: the policy takes over once the robot stands, 0.03 s after it was told to; it is in stand"
     assert (why in notes) == (reached == Mode.POLICY)
     unattended.look()
     for mode in (Mode.DAMPING, Mode.STAND):
