@@ -109,8 +109,7 @@ class Controller:
     def _not_standing(self) -> str:
         """Return why a policy must not take over."""
         if self.state is None or self.mode != Mode.STAND or self._now - self._since < self.brakes.stand_up:
-            when = f"once the robot stands, {self.brakes.stand_up:g} s after it was told to"
-            return f"the policy takes over {when}; it is in {self.mode.value}"
+            return f"the policy takes over once the robot stands, {self.brakes.stand_up:g} s after it was told to"
         off, allowed = np.abs(self.state.joint_positions - self._nominal_pose), self.brakes.max_pose_error
         worst = f"{self.joints.names[off.argmax()]} is {off.max():.2f} rad from the nominal pose"
         return f"{worst}, at most {allowed:g} are allowed" if off.max() > allowed else ""
@@ -192,9 +191,11 @@ class Controller:
         late, allowed = now - self._on_time, self.brakes.max_slow if missed > 1 else self.brakes.max_missed
         if late > allowed + 1e-6:
             return f"all deadlines of {1e3 * late:.0f} ms were missed"
-        lost, allowed = 1e3 * self._behind, 1e3 * self.brakes.max_behind
-        problem = f"late ticks have cost {lost:.1f} ms, at most {allowed:.0f} are allowed: try a lower --rate"
-        return problem if lost > allowed else ""
+        lost, allowed = self._behind, self.brakes.max_behind
+        if lost > allowed:
+            limit = f"at most {1e3 * allowed:.0f} are allowed"
+            return f"late ticks have cost {1e3 * lost:.1f} ms, {limit}: this computer is too slow or too busy"
+        return ""
 
     def _at_rest(self) -> MotorCommand:
         """Return the command of a robot that neither stands nor walks."""

@@ -1,5 +1,6 @@
 """Unitree's low-level topics over DDS: a robot as the program sees it, and a simulated robot's own side."""
 
+import math
 import socket
 import time
 from collections.abc import Callable
@@ -26,9 +27,10 @@ except ImportError as error:
 
 TOPICS: dict[type, str] = {LowCmd_: "rt/lowcmd", LowState_: "rt/lowstate", **SERVICE}
 DEPTH = 32  # messages that wait for the next look; at 500 Hz, 64 ms
+QUIET = 0.5  # seconds without commands of another program after which it counts as ended
 NUMBERS = 2**32  # numbers of messages start anew after these
-READER = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH))
-"""A message that is lost is never sent again: the next one is newer. Fits any writer."""
+READER = Qos(Policy.Reliability.BestEffort, Policy.History.KeepLast(DEPTH), Policy.IgnoreLocal.Participant)
+"""A message that is lost is never sent again: the next one is newer. Fits any writer but this side's own."""
 WRITER = Qos(
     Policy.Reliability.Reliable(max_blocking_time=0),  # fits any reader
     Policy.History.KeepLast(1),
@@ -136,7 +138,8 @@ class Go2Robot(_Side):
 
     States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message. While the robot's sport
     mode is not released, that is a problem, and no command is sent. A new sender of states is asked anew. Until it
-    answers, damping is sent: it may be another program next to a robot that walks.
+    answers, damping is sent: it may be another program next to a robot that walks. While another program commands the
+    robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun.
     """
 
     writes, reads = (LowCmd_, Request_), (LowState_, Response_)
@@ -146,6 +149,8 @@ class Go2Robot(_Side):
         """Join the robot's domain; arguments and errors are those of the base class."""
         super().__init__(interface, domain)
         self._sent, self._release = 0, Release(self._service_writer.write, is_optional=interface == "lo")
+        self._others = DataReader(self._participant, self._writer.topic, READER)  # commands that are not this program's
+        self._others_heard, self._problems = -math.inf, [self._release.problem]
 
     def receive(self) -> Received:
         """Return what has come, and ask for what is missing."""
@@ -154,13 +159,18 @@ class Go2Robot(_Side):
             self._release.begin()
         if self._release.problem:
             self._release.look(_taken(self._service_reader), time.monotonic())
-        received.problems += filter(None, [self._release.problem])
+        now = time.monotonic()
+        if _taken(self._others):
+            self._others_heard = now
+        others = f"another program sends {TOPICS[LowCmd_]}" if now - self._others_heard < QUIET else ""
+        self._problems = [problem for problem in (self._release.problem, others) if problem]
+        received.problems += self._problems
         return received
 
     def send(self, command: MotorCommand) -> None:
         """Tell the drives, once they are free; raises MessageError if a number is not finite."""
         is_damping = not (command.kp.any() or command.tau.any())
-        if not self._release.problem or (self._sent and is_damping and not self._release.mode):
+        if not self._problems or (self._sent and is_damping and not self._release.mode):
             self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
             self.publish(unitree_go2.encode_command(command, self._sent))
 

@@ -127,7 +127,7 @@ def join(device: str) -> None:
         while not meeting.ready():
             meeting.wait(_POLL)
             if any(process.poll() is not None for process in _started):
-                raise UserError("another process of this training has ended before it began")
+                raise UserError("another process has ended before the training began")
         meeting.get()
 
 

@@ -29,7 +29,7 @@ Trainings = dict[Cell, list[Path]]
 
 
 def find_trainings(folder: Path, problems: list[str]) -> Trainings:
-    """Return the trainings in a folder; each run that cannot be read adds a message to ``problems``.
+    """Return the trainings in a folder; runs that cannot be read or had other teachers add messages to ``problems``.
 
     Runs of the same task, run name, settings, random events and seed are one training that was interrupted and resumed;
     of two that both began at 0, the later one counts. Settings that differ between runs of a task follow its name.
@@ -39,7 +39,7 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
     """
     keys: dict[Path, tuple[str, str, int]] = {}
     configs: dict[Path, dict[str, Any]] = {}
-    for run in sorted({file.parent for file in folder.rglob(CONFIG_FILE)}, key=lambda path: path.name):
+    for run in sorted({file.parent for file in folder.rglob(CONFIG_FILE)}, key=lambda path: (path.name, path)):
         try:
             config = load_config(run)
             train = config["train"]
@@ -50,18 +50,22 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
             problems.append(f"the run '{run.relative_to(folder)}' cannot be read: {error}")
     if not keys:
         raise UserError(f"there is neither a file '{folder / SETTINGS_FILE}' nor a run with its {CONFIG_FILE}")
-    names: dict[str, str] = {}  # of trainings without paths of the machine, unless two have the same
-    runs: dict[tuple[str, str, int], list[Path]] = {}
-    for run, (task, environment, seed) in keys.items():
+    names: dict[Path, tuple[str, str]] = {}  # with paths of the machine, and without
+    for run, (task, environment, _) in keys.items():
         others = [configs[other] for other, key in keys.items() if key[:2] == (task, environment)]
         changes = differing(configs[run], others)
-        whole, short = (" ".join([task, *part]) for part in (changes, without_machine(changes)))
-        name = names.setdefault(whole, whole if short in names.values() else short)
+        names[run] = " ".join([task, *changes]), " ".join([task, *without_machine(changes)])
+    shorter = dict(names.values())
+    runs: dict[tuple[str, str, int], list[Path]] = {}
+    for run, (_, environment, seed) in keys.items():
+        whole, short = names[run]
+        name = whole if [*shorter.values()].count(short) > 1 else short
         runs.setdefault((name, environment, seed), []).append(run)
     trainings: Trainings = {}
     for key, parts in sorted(runs.items()):
         if len({str(configs[part].get("distillation.teachers")) for part in parts}) > 1:
-            problems.append(f"{key[0]}, seed {key[2]}, has runs of other teachers; of two that began at 0, one counts")
+            training = f"{key[0]} in {key[1]}, seed {key[2]}"
+            problems.append(f"{training}, has runs of other teachers; of two that began at 0, the later one counts")
         also = configs[parts[-1]].get("evaluation.also") or ()
         trainings[Cell(parts[-1], *key, tuple(dict.fromkeys([key[1], *map(str, also)])))] = parts
     return trainings

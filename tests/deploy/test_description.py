@@ -46,7 +46,7 @@ def test_notes_of_strangers(exported, description, tmp_path, monkeypatch):
     changed["episode"]["ends_on_contact_of"] = ["\x1b[31m"]
     write_description(folder, changed)
     monkeypatch.setattr(devices, "choose_offscreen_renderer", lambda: "no video, it takes long")
-    shorter = lambda walks, *_: evaluate(walks, 1, 2, 1)  # noqa: E731 - than 8000 steps
+    shorter = lambda walks, *_: evaluate(walks, 1, 2, 1)  # noqa: E731 - 2 steps, not 8000
     monkeypatch.setattr("legged_torque.deploy.simulation.evaluate", shorter)
     status, output, _ = run_here("publish.py", str(folder), root=tmp_path)
     assert status == 0 and "note: no geom's name contains \\x1b[31m" in output

@@ -100,14 +100,16 @@ def test_runs_with_other_settings(tmp_path):
     assert experiment.plan.tasks == names
     first, second = (experiment.runs_of(name, "low")[0] for name in names)
     assert len(first.rows) == len(second.rows) == 5 and len(first.configs) == 2
-    assert [problem.partition(", seed")[0] for problem in experiment.problems] == [names[0]]  # of its two teachers
+    assert [problem.partition(", seed")[0] for problem in experiment.problems] == [
+        f"{names[0]} in low"
+    ]  # of its two teachers
 
 
 def test_files_of_one_name(tmp_path):
-    """Runs whose files differ in the folder alone are two trainings: the second one keeps its folder."""
-    for day in (1, 2):
+    """Runs whose files differ in the folder alone are several trainings, whose names have the folders."""
+    files = [f"{folder}robot.xml" for folder in ("/home/me/v1/", "", "/home/me/v2/")]
+    for day, file in enumerate(files, 1):
         config = settings("mine", 1, "low")
-        config["env"]["asset"]["file"] = f"/home/me/v{day}/robot.xml"
+        config["env"]["asset"]["file"] = file
         write_run(tmp_path / f"2026-01-0{day}_00-00-00", whole_run(0.5), config)
-    files = ["robot.xml", "/home/me/v2/robot.xml"]
     assert sorted(read_experiment(tmp_path).plan.tasks) == sorted(f"mine asset.file={file}" for file in files)

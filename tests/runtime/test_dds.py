@@ -14,8 +14,12 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
 
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
 from legged_torque.runtime import unitree_go2 as go2
-from legged_torque.runtime.dds import Go2Robot, Go2Side
+from legged_torque.runtime.dds import QUIET, WRITER, Go2Robot, Go2Side
 from legged_torque.runtime.interface import MotorCommand
 from legged_torque.runtime.motion_switcher import Release, SportMode
 from legged_torque.utils.errors import UserError
@@ -111,6 +115,15 @@ def numbered(number):
     message = go2.encode_command(torques(abs(number)), abs(number))
     message["crc"] ^= number < 0
     return message
+
+
+def heard_of(robot, transport, *sent):
+    """The torque that the robot has heard last, of those that were sent; nan if it has heard nothing."""
+    for value in sent:
+        transport.send(torques(value))
+    time.sleep(0.2)
+    robot.tell([])
+    return robot.heard()[0]
 
 
 def looks(transport, seconds):
@@ -269,26 +282,42 @@ def test_robots_that_start_anew_and_two_at_once(transport):
 
 def test_another_program_next_to_a_robot(robot, transport):
     """A robot that walks is only damped until the motion switcher has answered again, and always hears of it."""
-
-    def heard_of(*sent):
-        """The torque that the robot has heard last, of those that were sent."""
-        for value in sent:
-            transport.send(torques(value))
-        time.sleep(0.2)
-        robot.tell([])
-        return robot.heard()[0]
-
-    assert heard_of(5.0) == 5.0
+    assert heard_of(robot, transport, 5.0) == 5.0
     with started() as other:
         found = []
         while not any(look.problems for look in found):
             other.tell([0])
             other.heard()
             found = looks(transport, 0.03)
-        assert heard_of(0.0, 1.0) == 0.0  # then its motion switcher has answered
+        assert heard_of(robot, transport, 0.0, 1.0) == 0.0  # then its motion switcher has answered
         for program in (robot, other, robot):
             said = [problem for look in program.told([0], transport) for problem in look.problems]
-            assert said == ["two programs send rt/lowstate"] and heard_of(3.0) == 3.0
+            assert said == ["two programs send rt/lowstate"] and heard_of(robot, transport, 3.0) == 3.0
+
+
+def test_another_program_that_commands(robot, transport):
+    """While another program sends commands, one that has sent some damps the robot, and one that has not is silent."""
+    participant = DomainParticipant(DOMAIN)
+    other = DataWriter(participant, Topic(participant, "rt/lowcmd", go2.LowCmd_), WRITER)
+
+    def said():
+        """What the program says once it has heard the other."""
+        problems = set()
+        for _ in range(100):
+            other.write(numbered(0))
+            problems |= {problem for look in looks(transport, 0.03) for problem in look.problems}
+            if problems:
+                break
+        heard_of(robot, transport)
+        return problems
+
+    for is_silent in (True, False):
+        assert said() == {"another program sends rt/lowcmd"}
+        assert np.isnan(heard_of(robot, transport, 5.0))
+        damping = heard_of(robot, transport, 0.0)
+        assert np.isnan(damping) if is_silent else damping == 0.0
+        assert not looks(transport, QUIET + 0.1)[-1].problems
+        assert heard_of(robot, transport, 7.0) == 7.0
 
 
 def test_nobody_there(transport, monkeypatch):

@@ -21,6 +21,7 @@ from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import RecordedLog
+from legged_torque.runtime.loop import PRIORITY
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
 from legged_torque.runtime.view import View
@@ -118,7 +119,7 @@ def test_only_the_loop_goes_before_other_programs(exported, tmp_path, monkeypatc
     """What draws the view and writes the log does not."""
     try:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
         os.sched_setscheduler(0, *before)
     except PermissionError:
         pytest.skip("real-time scheduling is not permitted here")

@@ -142,11 +142,11 @@ def test_gamepad(robot, tmp_path):
 def test_unattended(robot, reached):
     """A robot that another operator has damped stays so; why the policy waits is noted."""
     unattended, notes = operator.Unattended(robot.controller), set()
-    robot.controller.brakes.stand_up = 0.03  # seconds, of which each look takes 0.02
+    robot.controller.brakes.stand_up = 0.03  # seconds, of which each tick takes 0.02
     while does(robot)[0] != reached:
         unattended.look()
         notes.add(unattended.note)
-    why = "no policy now: the policy takes over once the robot stands, 0.03 s after it was told to; it is in stand"
+    why = "no policy now: the policy takes over once the robot stands, 0.03 s after it was told to"
     assert (why in notes) == (reached == Mode.POLICY)
     unattended.look()
     for mode in (Mode.DAMPING, Mode.STAND):
