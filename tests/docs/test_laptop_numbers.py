@@ -133,6 +133,12 @@ def test_laptop():
         for share, cell in zip((0.7, 0.8), cells, strict=True):
             seconds = of_task[of_task["track_percentage"] >= share].groupby("seed")["seconds"].min()
             assert list(seconds.index) == [1, 2, 3, 4] and cell == ", ".join(after(seconds)), (task, share)
+    runs = data.groupby(["task", "seed", "commit"])[["steps", "seconds"]].max()
+    speeds, minutes = runs["steps"] / runs["seconds"], runs[runs["steps"] > 19e6]["seconds"] / 60
+    _, rows = rows_of("getting_started.md", "| GPU (H200)")
+    said = {name: cell for name, *_, cell in rows}
+    assert said["steps per second"] == " to ".join(f"{round(speed, -2):,.0f}" for speed in (speeds.min(), speeds.max()))
+    assert said["the default training takes"] == f"17 to {minutes.max():.0f} minutes"
     last = data[(data["steps"] > 0.82 * 20e6) & (data["seed"] == 1)].groupby("task")["track_percentage"]
     assert (last.size() == 8).all()
     ends = [f"{end:.2f}" for end in last.mean()]
