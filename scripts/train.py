@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
 
 LONG_ON_CPU = 50_000_000  # steps, which take an hour or more
-LONG_NOTE = "this training takes hours on a CPU; --preset laptop takes minutes, and Ctrl-C keeps the run"
 
 
 def main() -> None:
@@ -118,6 +117,13 @@ def new_settings(options: Options) -> tuple[Any, Any]:
     return env_cfg, train_cfg
 
 
+def length_note(train_cfg: Any) -> str:
+    """Return that a training takes hours on a CPU, and what takes less if its task has that; empty if it does not."""
+    shorter = f"--preset {CPU_PRESET} takes minutes, and " if CPU_PRESET in train_cfg.presets() else ""
+    note = f"this training takes hours on a CPU; {shorter}Ctrl-C keeps the run"
+    return note if train_cfg.runner.total_steps >= LONG_ON_CPU else ""
+
+
 def learns_in_parts(train_cfg: Any) -> bool:
     """Return whether processes can train the settings' learner together."""
     from rsl_rl.utils import resolve_callable
@@ -162,9 +168,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     if is_first:
         if env.device == "cpu":
             is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
-            is_long = train_cfg.runner.total_steps > LONG_ON_CPU and not is_short
             threads = max(torch.get_num_threads(), distributed.world_size())
-            print_notes([LONG_NOTE if is_long else "", busy_cores_note(threads)])
+            print_notes(["" if is_short else length_note(train_cfg), busy_cores_note(threads)])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False

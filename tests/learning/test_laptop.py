@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import signal
 import subprocess
 import sys
@@ -79,6 +80,19 @@ def test_one_ends_before_all_have_joined(tmp_path):
     assert_told_in_one_line(
         (done.returncode, done.stdout, done.stderr), "another process has ended before the training began"
     )
+
+
+SHORTER = " --preset laptop takes minutes, and"
+LONG = [("a1_position", "parallel", SHORTER), ("a1_position", "flashsac", SHORTER), ("a1_torque_gravity", None, "")]
+
+
+@pytest.mark.parametrize(("task", "preset", "shorter"), LONG)
+def test_long_trainings(task, preset, shorter):
+    """What takes hours on a CPU is told before it begins, with the shorter preset where a task has it."""
+    note = runpy.run_path(str(ROOT / "scripts" / "train.py"))["length_note"]
+    said = note(task_registry.get_cfgs(task, Options(task=task, preset=preset))[1])
+    assert said == f"this training takes hours on a CPU;{shorter} Ctrl-C keeps the run"
+    assert not note(task_registry.get_cfgs("a1_position", Options(task="a1_position", preset="laptop"))[1])
 
 
 @pytest.mark.parametrize("steps", [0, 700_000, 2_000_000, 20_000_000])
