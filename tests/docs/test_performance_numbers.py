@@ -21,6 +21,8 @@ def test_training_speed():
         assert int(worlds) == row["worlds"] and same(million, row["iteration_steps_per_s"] / 1e6)
         assert all(same(text, row[key]) for text, key in zip(times, keys, strict=True)), row
         assert same(memory, row["peak_memory_mib"] / 1024)
+    said = f"{DATA[0]['rows'][0]['iteration_steps_per_s'] / 1e6:.1f} million steps/s without evaluations"
+    assert all(said in page.read_text("utf-8") for page in (DOCS / "index.md", DOCS.parent / "README.md"))
 
 
 def test_start():

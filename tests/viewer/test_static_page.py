@@ -23,10 +23,10 @@ def test_refused():
     changed["observations"]["history_length"] = 2
     changed["observations"]["terms"].append({"name": "height_scan"})
     changed["actions"]["terms"][0] |= {"interval": 4}
+    changed["network"]["memory"] = ["gru"]
     changed["motors"] |= {"drive": {"model": "drive"}, "heat": {"model": "thermal"}}
-    with pytest.raises(
-        UserError, match=r"the observation height.*interval of position_residual; .*history.*; the motor heat"
-    ):
+    named = r"the observation height.*interval of position_residual; .*history.*; a recurrent network; the motor heat"
+    with pytest.raises(UserError, match=named):
         static_page.check(SimpleNamespace(description=changed))
 
 
