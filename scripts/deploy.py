@@ -2,7 +2,7 @@
 
 Examples:
     python scripts/deploy.py exported --interface sim                # a simulated robot in this process
-    python scripts/deploy.py exported --interface lo --domain 1      # sim_robot.py in another terminal
+    python scripts/deploy.py exported --interface lo                 # sim_robot.py in another terminal
     python scripts/deploy.py exported --interface eth0               # a Unitree Go2; never tried on hardware
     python scripts/deploy.py exported --interface sdk --gamepad      # an A1 or Go1; never tried on hardware
 
@@ -12,11 +12,13 @@ Keys: s stand up, p policy, d or space damping, x no torque, arrows, comma and p
 import argparse
 import contextlib
 import os
+import pkgutil
 import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,10 +36,11 @@ def parse_args() -> argparse.Namespace:
     """Parse and check the command line."""
     parser = cli.Parser(__doc__)
     parser.add_argument("policy", type=Path, help="policy.yaml, policy.onnx, or the folder of both")
+    parser.add_argument("--robot", help="name of the robot at the other end; default: the policy's")
     hint = "network interface of a Unitree Go2, lo for sim_robot.py, sim for a simulated robot in this process, "
-    hint += "or sdk for an A1 or Go1 through unitree_legged_sdk"
+    hint += "sdk for an A1 or Go1 through unitree_legged_sdk, or FILE.py:CLASS, a transport of your own"
     parser.add_argument("--interface", required=True, help=hint)
-    parser.add_argument("--domain", type=int, help="of DDS alone; default: 0, Unitree's")
+    parser.add_argument("--domain", type=int, help="of DDS alone; default: 1 on lo, as sim_robot.py, else 0, Unitree's")
     hint = "commands per second; default: the largest multiple of the policy's rate up to 500; "
     hint += "sim_robot.py damps after 15 ms without one"
     parser.add_argument("--rate", type=float, help=hint)
@@ -59,8 +62,8 @@ def parse_args() -> argparse.Namespace:
     cli.check_args(args, power=Annotated[int, Limits(1, 10)])
     if args.power and args.interface != "sdk":
         raise UserError("--power is for --interface sdk: it limits unitree_legged_sdk's motors")
-    if args.domain is not None and args.interface in ("sim", "sdk"):
-        raise UserError("--domain is of DDS, which --interface sim and sdk do without")
+    if args.domain is not None and (args.interface in ("sim", "sdk") or ".py:" in args.interface):
+        raise UserError("--domain is of DDS, which --interface sim, sdk and FILE.py:CLASS do without")
     if args.chirp and args.command:
         raise UserError("--command is for policies: --chirp has sweeps in place of one")
     if args.walk and args.interface not in ("sim", "lo"):
@@ -97,9 +100,14 @@ def main() -> None:
         """Write the log and draw the view, in a thread of its own: a disk or a terminal may keep that waiting."""
         with contextlib.suppress(OSError, AttributeError):  # as other programs, after the loop
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        identity = [0] * 4
         while not ended.wait(POLL):
             if log:
                 log.write()
+            if controller.state is not None and controller.state.identity.tolist() != identity:
+                identity = controller.state.identity.tolist()
+                said = f"the robot's firmware is {identity[:2]}, its serial number {identity[2:]}"
+                say(partial(print, said, flush=True))
             say(view.show)
 
     with StopRequest(lambda text: None) as stop, contextlib.ExitStack() as parts:
@@ -152,14 +160,34 @@ def chirp(args: argparse.Namespace, policy: Any) -> Any:
 
 
 def connect(args: argparse.Namespace, policy: Any) -> Any:
-    """Return the transport to the robot."""
+    """Return the transport to the robot; a UserError if the policy is of another one, or may ask for more torque."""
+    trained = policy.description["robot"]["name"]
+    if args.robot not in (None, trained):
+        raise UserError(f"--robot must be '{trained}', of which the policy is, not '{args.robot}'")
     if args.interface == "sim":
         from legged_torque.runtime.in_process import InProcess
         from legged_torque.runtime.sim_robot import SimRobot
 
         xml = resource_path(policy.description["robot"]["file"])
         return InProcess(SimRobot(xml, policy.joint_order, args.rate, hangs=bool(args.chirp)))
-    trained = policy.description["robot"]["name"]
+    transport = outside(args, trained)
+    for joint, most in zip(transport.joint_order, transport.torque_limits, strict=True):
+        asked = max(map(abs, policy.description["torque_limits"].get(joint, [0.0])))
+        if asked > most * (1.0 + 1e-6):  # limits of exports were float32
+            raise UserError(f"the policy may ask {joint} for {asked:g} N m, the robot's motor can give {most:g} N m")
+    return transport
+
+
+def outside(args: argparse.Namespace, trained: str) -> Any:
+    """Return the transport to a robot outside of this process, of the name with which a policy was trained."""
+    if ".py:" in args.interface:  # code of the user's, who names it here
+        file, _, name = args.interface.rpartition(":")
+        sys.path.append(str(Path(file).absolute().parent))
+        try:
+            kind = pkgutil.resolve_name(f"{Path(file).stem}:{name}")
+        except (ImportError, AttributeError, ValueError) as error:
+            raise UserError(f"--interface FILE.py:CLASS has no '{args.interface}': {error}") from None
+        return kind()
     if args.interface == "sdk":
         from legged_torque.runtime.legged_sdk import LeggedSdkRobot
 
@@ -169,7 +197,7 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
     if trained != ROBOT:
         others = f"DDS leads to a '{ROBOT}', --interface sdk to A1 and Go1"
         raise UserError(f"the policy is of the robot '{trained}'; {others}")
-    return Go2Robot(args.interface, args.domain or 0)
+    return Go2Robot(args.interface, int(args.interface == "lo") if args.domain is None else args.domain)
 
 
 if __name__ == "__main__":

@@ -43,6 +43,7 @@ def main() -> None:
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy
         from legged_torque.envs import task_registry
+        from legged_torque.runtime.chirp import CHECKSUM
         from legged_torque.runtime.log import RecordedLog
         from legged_torque.runtime.replay import same_actions, simulate
         from legged_torque.runtime.sim_robot import SimRobot
@@ -52,13 +53,16 @@ def main() -> None:
 
             load_pyplot()  # a UserError if it is missing
     log, policy = RecordedLog(args.log), Policy(args.policy)
-    steps, equal = same_actions(log, policy)
-    print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
+    hangs = log.sha256 == CHECKSUM  # sweeps in place of a policy
+    if not hangs:
+        steps, equal = same_actions(log, policy)
+        print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")
     cfg = task_registry.get_cfgs(policy.description["task"])[0]
     cfg.motors.restore(policy.description.get("motors", {}))
     latency = simulated_latency(cfg, args.motors, args.latency)
     xml, rate = resource_path(policy.description["robot"]["file"]), 1.0 / log.period
-    gap = simulate(log, SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=latency))
+    robot = SimRobot(xml, log.joint_order, rate, motors=cfg.motors, latency=latency, hangs=hangs)
+    gap = simulate(log, robot)
     parts = gap.parts_at(args.limit)
     until = min(parts.min(), gap.times[-1])
     print(f"joint: parts by {args.limit:g} rad at [s]; rms gap in the first {until:.2f} s [rad]")

@@ -36,7 +36,9 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, help="end after this time; default: with Ctrl-C")
     parser.add_argument("--motors", default="ideal", help="ideal, real, ..., or a file of identify.py; default: ideal")
     parser.add_argument("--latency", type=float, help="of commands [ms]; default: that of a file of motors, or 0")
-    hint = "lost, damaged (shares of messages), delay [s], silent=1; dead, hot or error=JOINT; may be repeated"
+    hint = (
+        "lost, damaged (shares of messages), delay [s], push [m/s], silent=1; dead, hot or error=JOINT; may be repeated"
+    )
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
     parser.add_argument("--fault_at", type=float, default=0.0, help="second at which faults begin; default: at once")
     parser.add_argument("--viewer", action="store_true", help="show it in MuJoCo's window, where the mouse pushes it")
@@ -121,7 +123,7 @@ def with_faults(faults: object, words: list[str], joints: list[str]) -> object:
             getattr(faults, name).append(value)
             continue
         try:
-            number = check_value(f"--fault {name}", float(value), NotNegative if name == "delay" else Share)
+            number = check_value(f"--fault {name}", float(value), NotNegative if name in ("delay", "push") else Share)
         except ValueError:
             raise UserError(f"--fault {name} takes a number, not '{value}'") from None
         setattr(faults, name, type(getattr(faults, name))(number))

@@ -13,6 +13,7 @@ from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
 
+LARGEST_ACTION = 100.0  # times the clip, or 1 if that is less: saturated networks say some times the clip, not this
 IN_OLD_NETWORKS = ("joint_order", "nominal_pose", "observations", "actions")
 """Sections that networks hold which were exported before all sections were stored."""
 
@@ -122,11 +123,15 @@ class Policy:
     def act(self, obs: np.ndarray) -> np.ndarray:
         """Return clipped mean actions, or held ones where new ones are not due, kept as ``last_action``.
 
-        Call it once per control step. A UserError if they are not finite. Shape: (actions,).
+        Call it once per control step. A UserError if they are not finite, or far beyond the clip. Shape: (actions,).
         """
         actions = run_network(self.session, np.asarray(obs, np.float32)[np.newaxis], self._memory)
         if not np.isfinite(actions).all():  # such actions must not reach a robot
             raise UserError("the network's actions are not finite: check the observations")
+        worst, largest = int(np.abs(actions).argmax()), LARGEST_ACTION * max(1.0, *np.abs(self._action_clip))
+        if abs(action := actions[0, worst]) > largest:
+            joint = self.joint_order[worst % len(self.joint_order)]
+            raise UserError(f"the network's action for {joint} is {action:.4g}, beyond {largest:g}")
         new = np.clip(actions[0], *self._action_clip)
         is_due = np.repeat([self.phase(term["name"]) == 0.0 for term in self._action_terms], len(self.joint_order))
         self.last_action = np.where(is_due, new, self.last_action)

@@ -12,6 +12,7 @@ from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, 
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
 MOST_COMMANDS = 500.0  # a second, unless more are asked for
+OPERATOR = "stopped by the operator"
 FORGIVEN = 0.4  # time constant with which the time that late ticks have cost is forgiven [s]; 95% of the rate will do
 
 
@@ -36,7 +37,7 @@ class Controller:
 
     Attributes:
         mode: What the robot does.
-        reason: Why it was stopped; empty if it was not.
+        reason: Why it was stopped, until it stands up again; empty if it was not.
         joints: Limits of the robot's joints, in its own order.
         state: The newest state; None before the first.
         velocity_command: v_x, v_y [m/s] and yaw rate [rad/s] for the policy. Shape: (3,).
@@ -98,11 +99,14 @@ class Controller:
         """
         with self._lock:
             checks = {Mode.STAND: self._fault, Mode.POLICY: self._not_standing}
-            if mode in checks and (problem := checks[mode]()):
-                return problem
-            self._enter(mode)
-            self.reason = ""
-            if mode in (Mode.PASSIVE, Mode.DAMPING):
+            if mode in checks:
+                if problem := checks[mode]():
+                    return problem
+                self._enter(mode)
+                self.reason = ""
+            else:
+                self.stop(OPERATOR)  # does not replace the reason of an earlier stop
+                self._enter(mode)
                 self.sent = self._at_rest()  # the command of this tick may not have been sent yet
         return ""
 

@@ -137,20 +137,25 @@ class Go2Robot(_Side):
     """A robot, real or simulated, as the program sees it: a :class:`~legged_torque.runtime.interface.Transport`.
 
     States are numbered by ``tick`` in milliseconds: a gap of two periods is a lost message. While the robot's sport
-    mode is not released, that is a problem, and no command is sent. A new sender of states is asked anew. Until it
+    mode is not released, that is a problem, and no command is sent. Its service must answer in domain 0, that of
+    Unitree's robots; in others it may be missing, as in unitree_mujoco. A new sender of states is asked anew. Until it
     answers, damping is sent: it may be another program next to a robot that walks. While another program commands the
-    robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun.
+    robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun. So are another
+    firmware or serial number than at first, to the end.
     """
 
+    torque_limits = [23.7, 23.7, 45.43] * 4  # of hips, thighs and calves [N m]
     writes, reads = (LowCmd_, Request_), (LowState_, Response_)
     decode, number, step = staticmethod(unitree_go2.decode_state), "tick", unitree_go2.STATE_PERIOD
 
     def __init__(self, interface: str, domain: int) -> None:
         """Join the robot's domain; arguments and errors are those of the base class."""
         super().__init__(interface, domain)
-        self._sent, self._release = 0, Release(self._service_writer.write, is_optional=interface == "lo")
+        self._sent, self._release = 0, Release(self._service_writer.write, is_optional=domain != 0)
         self._others = DataReader(self._participant, self._writer.topic, READER)  # commands that are not this program's
         self._others_heard, self._problems = -math.inf, [self._release.problem]
+        self._identity: Any = None  # of the first state
+        self._exchanged = ""
 
     def receive(self) -> Received:
         """Return what has come, and ask for what is missing."""
@@ -163,7 +168,11 @@ class Go2Robot(_Side):
         if _taken(self._others):
             self._others_heard = now
         others = f"another program sends {TOPICS[LowCmd_]}" if now - self._others_heard < QUIET else ""
-        self._problems = [problem for problem in (self._release.problem, others) if problem]
+        if isinstance(state := received.newest, RobotState):
+            self._identity = state.identity if self._identity is None else self._identity
+            if (state.identity != self._identity).any():
+                self._exchanged = "the robot's firmware or serial number is not that of its first state: start anew"
+        self._problems = [problem for problem in (self._release.problem, others, self._exchanged) if problem]
         received.problems += self._problems
         return received
 

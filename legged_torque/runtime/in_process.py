@@ -1,5 +1,7 @@
 """A simulated robot in the same process, for a first try and for tests: it has no wire, and no time of its own."""
 
+import numpy as np
+
 from legged_torque.runtime.interface import MotorCommand, Received
 from legged_torque.runtime.sim_robot import SimRobot
 
@@ -10,11 +12,13 @@ class InProcess:
     Attributes:
         robot: The robot.
         joint_order: Names of its joints.
+        torque_limits: Of its motors [N m].
     """
 
     def __init__(self, robot: SimRobot) -> None:
         """Take the robot."""
         self.robot, self.joint_order = robot, robot.joint_order
+        self.torque_limits = np.abs(robot.limits).max(axis=0).tolist()
         self._tick = 0
 
     def receive(self) -> Received:

@@ -22,6 +22,7 @@ class RobotState:
     joint_torques: np.ndarray  # as the drives estimate them [N m]; (joints,)
     temperatures: np.ndarray  # of the motors [deg C]; (joints,)
     errors: np.ndarray  # error flags of the motors, 0 is none; (joints,)
+    identity: np.ndarray = field(default_factory=lambda: np.zeros(4, int))  # version of firmware, serial number; (4,)
 
 
 @dataclass
@@ -60,13 +61,15 @@ class PolicyStep:
 
 
 class Transport(Protocol):
-    """The robot as the program sees it. A new one is one file.
+    """The robot as the program sees it. A new one is one file: deploy.py --interface FILE.py:CLASS calls its class.
 
     Attributes:
         joint_order: Names of the joints in the robot's own order.
+        torque_limits: What their motors can give at most [N m]; a policy that may ask for more is refused.
     """
 
     joint_order: list[str]
+    torque_limits: list[float]
 
     def receive(self) -> Received:
         """Return what has come from the robot since the last call; never waits."""

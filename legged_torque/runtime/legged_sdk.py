@@ -9,6 +9,7 @@ from legged_torque.runtime.interface import JOINT_ORDER, NO_POSITION, NO_VELOCIT
 from legged_torque.utils.errors import UserError, check_names
 
 KINDS = {"a1": "A1", "go1": "Go1"}  # names of the SDK
+TORQUES = {"a1": [33.5, 33.5, 33.5], "go1": [23.7, 23.7, 35.55]}  # largest of hip, thigh and calf [N m]
 LOW_LEVEL, LOCAL_PORT, ROBOT = 0xFF, 8080, ("192.168.123.10", 8007)
 SERVO, OVERHEATED = 0x0A, 0x08  # modes of a motor
 AT_ONCE = 32  # messages of a look, at most
@@ -29,6 +30,7 @@ class LeggedSdkRobot:
             import robot_interface as sdk
         except ImportError as error:
             raise UserError(f"A1 and Go1 need robot_interface of unitree_legged_sdk in PYTHONPATH ({error})") from None
+        self.torque_limits = TORQUES[robot] * 4
         self._udp = sdk.UDP(LOW_LEVEL, LOCAL_PORT, *ROBOT)
         self._safety, self._power = sdk.Safety(getattr(sdk.LeggedType, KINDS[robot])), power
         self._command, self._state, self._tick = sdk.LowCmd(), sdk.LowState(), 0

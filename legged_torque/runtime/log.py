@@ -25,7 +25,13 @@ except ImportError as error:
     raise UserError(f"logs need the extra: pip install 'legged_torque[robot]' ({error})") from None
 
 TICK, POLICY, ROBOT = "tick", "policy", "robot"
-"""Channels: each tick; each step of the policy. And the metadata: whose log this is."""
+"""Channels: each tick; each step of the policy. And the metadata: whose log this is.
+
+A tick has the controller's ``mode``, ``reason`` of a stop and ``velocity_command``; ``state`` and ``command``; how many
+messages were ``damaged``, ``lost`` or ``late``, and other ``problems``; whether it ``missed`` its deadline; by how much
+it began after its time, ``lateness``, and the time it ``took`` until its command was sent [s]. Older logs lack
+``problems``, ``lateness`` and ``took``.
+"""
 _NS = 1e9
 _CHUNK = 2**16  # bytes that are written at a time
 
@@ -62,11 +68,12 @@ class Log:
         schema = self._writer.register_schema("object", "jsonschema", b'{"type": "object"}')
         self._channels = {name: self._writer.register_channel(name, "json", schema) for name in (TICK, POLICY)}
 
-    def add(self, now: float, missed: bool, received: Received, command: MotorCommand) -> None:
-        """Keep a tick that has just been made, at a time [s], and the command that was sent."""
+    def add(self, now: float, missed: bool, received: Received, command: MotorCommand, **times: float) -> None:
+        """Keep a tick that has just been made, at a time [s], the command that was sent, and further times."""
         controller, step = self._controller, self._controller.policy_step
         state = received.newest if isinstance(received.newest, RobotState) else None
         tick: dict[str, Any] = {"mode": controller.mode.value, "reason": controller.reason, "missed": missed}
+        tick |= times | {"problems": received.problems}
         tick |= {"damaged": received.wrong_crc, "lost": received.lost, "late": received.late}
         tick |= {"velocity_command": controller.velocity_command.copy(), "state": state, "command": command}
         self._waiting.append((TICK, now, tick))
@@ -123,7 +130,7 @@ class RecordedLog:
             raise UserError(f"'{file}' is no log of deploy.py: {str(error) or 'it does not say whose'}") from None
 
     def ticks(self) -> Iterator[tuple[float, RobotState | None, MotorCommand, dict[str, Any]]]:
-        """Yield time [s], state, command and the rest of each tick."""
+        """Yield time [s], state, command and the rest of each tick, see :data:`TICK`."""
         for time, message in self._messages(TICK):
             state, command = message.pop("state"), message.pop("command")
             yield time, state and RobotState(**_arrays(state)), MotorCommand(**_arrays(command)), message

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from cyclonedds.idl import make_idl_struct
-from cyclonedds.idl.types import int32, int64, sequence, uint8
+from cyclonedds.idl.types import byte, int32, int64, sequence
 
 CHECK_MODE, RELEASE_MODE = 1001, 1003
 AGAIN = 0.2  # seconds between two requests
@@ -27,10 +27,10 @@ Identity_ = _struct("RequestIdentity_", id=int64, api_id=int64)
 Lease_ = _struct("RequestLease_", id=int64)
 Policy_ = _struct("RequestPolicy_", priority=int32, noreply=bool)
 RequestHeader_ = _struct("RequestHeader_", identity=Identity_, lease=Lease_, policy=Policy_)
-Request_ = _struct("Request_", header=RequestHeader_, parameter=str, binary=sequence[uint8])
+Request_ = _struct("Request_", header=RequestHeader_, parameter=str, binary=sequence[byte])
 Status_ = _struct("ResponseStatus_", code=int32)
 ResponseHeader_ = _struct("ResponseHeader_", identity=Identity_, status=Status_)
-Response_ = _struct("Response_", header=ResponseHeader_, data=str, binary=sequence[uint8])
+Response_ = _struct("Response_", header=ResponseHeader_, data=str, binary=sequence[byte])
 SERVICE = {Request_: "rt/api/motion_switcher/request", Response_: "rt/api/motion_switcher/response"}
 
 

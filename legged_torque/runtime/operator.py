@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import select
 import socket
 import struct
@@ -23,6 +24,8 @@ KEY_MODES = {"s": Mode.STAND, "p": Mode.POLICY, "d": Mode.DAMPING, " ": Mode.DAM
 KEY_MODES |= {"\x1a": Mode.DAMPING, "\x1c": Mode.DAMPING}  # Ctrl-Z, Ctrl-\
 KEYS = {"\x1b[A": (0, 0.1), "\x1b[B": (0, -0.1), ",": (1, 0.1), ".": (1, -0.1), "\x1b[D": (2, 0.1), "\x1b[C": (2, -0.1)}
 """Index in the command and its change [m/s or rad/s], by keys: up, down, comma, period, left and right."""
+PRESSED = re.compile(r"\x1b+([O[][0-?]*[!-~]?|[!-ce-~])?|.", re.DOTALL)
+"""A key, or all that a terminal sends for one of no character, or with Alt; after Escape, d and space still count."""
 NUMBERS = ("forward", "sideways", "turn")  # of a datagram: v_x, v_y [m/s] and yaw rate [rad/s]
 LONGEST, AT_ONCE = 256, 100  # bytes of a datagram, and datagrams of a look
 SILENCE = 1.0  # seconds without datagrams after which the command is 0
@@ -112,10 +115,8 @@ class Keyboard(Operator):
     def look(self) -> None:
         """Carry out the keys that were pressed since the last look, as a terminal sends them."""
         is_pressed = self._terminal is not None and select.select([sys.stdin], [], [], 0.0)[0]
-        text = os.read(sys.stdin.fileno(), 64).decode(errors="ignore") if is_pressed else ""
-        while text:
-            key = next((name for name in KEYS if text.startswith(name)), text[0])
-            text = text[len(key) :]
+        text = os.read(sys.stdin.fileno(), 4096).decode(errors="ignore") if is_pressed else ""  # a terminal's buffer
+        for key in (found[0] for found in PRESSED.finditer(text)):
             self.has_ended |= key == "q"
             if key in KEY_MODES:
                 self.ask(KEY_MODES[key])

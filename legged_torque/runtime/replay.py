@@ -50,7 +50,7 @@ class Gap:
 
 
 def simulate(log: RecordedLog, robot: SimRobot) -> Gap:
-    """Give a simulated robot, which lies as that of the log at its start, all commands of the log, each in time.
+    """Give a simulated robot, which begins in the first state of the log, all commands of the log, each in time.
 
     Where the program was late, a robot that keeps time has gone on under the command before. A UserError if the log has
     no states.
@@ -59,7 +59,7 @@ def simulate(log: RecordedLog, robot: SimRobot) -> Gap:
     state, start = None, 0.0
     for time, newest, command, _ in log.ticks():
         if state is None and newest is not None:
-            robot.lie_down(newest.joint_positions)
+            robot.lie_down(newest.joint_positions, newest.quaternion)
             start = time
         state = newest or state
         if state is not None and log.keeps_time:

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from legged_torque.runtime.controller import Controller, Mode
+from legged_torque.runtime.controller import OPERATOR, Controller, Mode
 from legged_torque.runtime.interface import Received, Transport
 
 FAREWELL = 0.1  # seconds in which damping is sent at the end
@@ -18,7 +18,7 @@ class Session:
     Attributes:
         controller: The controller.
         counts: Messages, and those that were damaged, lost or late.
-        stops: Reasons of all stops, in order.
+        stops: Reasons of all stops but the operator's, in order.
         log: Where the ticks are kept; None if nowhere.
     """
 
@@ -30,11 +30,14 @@ class Session:
         ``clock`` returns the time [s] that ticks are given: a test's robot has a time of its own.
         """
         self.controller, self._transport, self.log, self._clock = controller, transport, log, clock
+        self._due: float | None = None  # when the next tick should begin [s]
         self.counts: Counter[str] = Counter()
         self.stops: list[str] = []
 
     def tick(self, now: float, missed: bool) -> None:
         """Listen, decide, and tell the drives; see :class:`~legged_torque.runtime.loop.RealTimeLoop`."""
+        late = 0.0 if self._due is None else now - self._due
+        self._due = (now if missed else now - late) + self.controller.period  # as the loop's
         try:
             received = self._transport.receive()
         except Exception as error:  # whatever it is, the robot must be told to damp
@@ -45,13 +48,14 @@ class Session:
         self.controller.step(received, now, missed)
         command = self.controller.command_at(self._clock())
         self._transport.send(command)
-        if self.controller.reason and self.controller.reason != before:
+        if self.controller.reason not in ("", before, OPERATOR):
             self.stops.append(self.controller.reason)
         if self.log:
-            self.log.add(now, missed, received, command)
+            self.log.add(now, missed, received, command, lateness=late, took=self._clock() - now)
 
     def close(self) -> None:
         """Leave the robot in damping, after the loop has ended; what fails meanwhile is raised at the end."""
+        self.controller.stop("the program ends")
         self.controller.request(Mode.DAMPING)
         end = time.monotonic() + FAREWELL
         with contextlib.ExitStack() as parts:
@@ -61,6 +65,7 @@ class Session:
             error: BaseException | None = None
             while time.monotonic() < end:
                 try:
+                    self._due = self._clock() + self.controller.period  # no loop gives the times of these ticks
                     time.sleep(self.controller.period)
                     self.tick(self._clock(), missed=False)
                 except BaseException as failure:  # the next message may arrive, also after Ctrl-C

@@ -15,11 +15,12 @@ from legged_torque.motors.model_config import MotorsCfg
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import hang_up, loading, set_joints, torque_per_control, torque_range
+from legged_torque.utils.mjcf import colliding_pairs, hang_up, loading, set_joints, torque_per_control, torque_range
 
 WATCHDOG = 0.015  # seconds without a command after which the drives damp by themselves
 DAMPING = 3.0  # of the drives then [N m s/rad]
 STEP = 1e-3  # longest of the physics, at which the drives close their loops [s]
+FAR = 10.0  # farther than any part is from the ground [m]
 FOLDED = {"hip": 0.0, "thigh": 1.25, "calf": -2.65}  # angles of a robot that lies on its belly [rad]
 
 
@@ -35,6 +36,7 @@ class Faults:
     error: list[str] = field(default_factory=list)  # joints whose motors raise an error flag
     not_finite: bool = False  # whether a joint's position is NaN
     silent: bool = False  # whether it says nothing at all
+    push: float = 0.0  # sudden change of the trunk's velocity in a random level direction, once [m/s]
 
 
 class SimRobot:
@@ -48,7 +50,7 @@ class SimRobot:
         data: Its state.
         faults: What is wrong.
         watchdog_ticks: Messages that were sent while the watchdog damped, after the first command.
-        excess: Largest torque beyond a limit that a command has asked for in the state in which it arrived [N m].
+        excess: Largest torque beyond a limit that a command has asked for in any physics step [N m].
         is_damping: Whether the drives only damp now.
     """
 
@@ -94,26 +96,35 @@ class SimRobot:
         self._applied = np.zeros(len(joint_order))
         self.lie_down()
 
-    def lie_down(self, joint_positions: np.ndarray | None = None) -> None:
-        """Lay the robot on its belly, with folded legs, or with these joint positions [rad]. Shape: (joints,)."""
+    def lie_down(self, joint_positions: np.ndarray | None = None, quaternion: np.ndarray | None = None) -> None:
+        """Lay the robot on its belly with folded legs, or put it on the ground as it was measured.
+
+        Joint positions [rad] have the shape (joints,); the quaternion of the trunk is (w, x, y, z).
+        """
         mujoco.mj_resetData(self.model, self.data)
         self._on_their_way.clear()  # their times are of the clock before
         low, high = self.model.jnt_range[[self.model.joint(name).id for name in self.joint_order]].T
         folded = [next(angle for part, angle in FOLDED.items() if part in name) for name in self.joint_order]
         self.data.qpos[self._qpos] = np.clip(folded, low, high) if joint_positions is None else joint_positions
-        self.data.qpos[2] = 0.15
+        if quaternion is not None:
+            self.data.qpos[3:7] = quaternion
+        mujoco.mj_kinematics(self.model, self.data)
+        pairs = [pair for pair in colliding_pairs(self.model).tolist() if 0 in self.model.geom_bodyid[pair]]
+        gaps = [mujoco.mj_geomDistance(self.model, self.data, *pair, FAR, None) for pair in pairs]
+        self.data.qpos[2] -= min(gaps, default=0.0)  # a robot that hangs touches nothing
         self.data.xfrc_applied[1, :3] = self._lift
         mujoco.mj_forward(self.model, self.data)
 
     def step(self, received: Received) -> None:
         """Move on for the time between two messages, under the newest command."""
         self._age += self._steps * self.model.opt.timestep
+        if self.faults.push:
+            angle = self._rng.uniform(-math.pi, math.pi)
+            self.data.qvel[:2] += self.faults.push * np.array([math.cos(angle), math.sin(angle)])
+            self.faults.push = 0.0
         if isinstance(received.newest, MotorCommand):
             self._on_their_way.append((self.data.time + self._latency, received.newest))
             self._age = 0.0
-            asked = received.newest.torques(self.data.qpos[self._qpos], self.data.qvel[self._dofs])
-            low, high = self.limits
-            self.excess = max(self.excess, float(np.maximum(asked - high, low - asked).max()))
         zeros = np.zeros(len(self.joint_order))
         damping, had_command = MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING), self._command is not None
         is_dead = np.isin(self.joint_order, self.faults.dead)
@@ -124,7 +135,9 @@ class SimRobot:
             command = self._command if self._age <= WATCHDOG else None
             self.is_damping = command is None
             pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]
-            asked = (command or damping).torques(pos, vel)
+            asked = (command or damping).torques(*self._drives.measured(pos, vel))
+            if command is not None:
+                self.excess = max(self.excess, float(np.maximum(asked - self.limits[1], self.limits[0] - asked).max()))
             self._applied = np.where(is_dead, 0.0, self._drives.apply(asked, pos, vel))
             self.data.ctrl[self._motors] = self._applied / self._torque_per_control
             mujoco.mj_step(self.model, self.data)
@@ -147,10 +160,11 @@ class SimRobot:
         """Return the next message, or none if it is lost or late, and whether it is to be damaged on its way."""
         faults, names, qpos, qvel = self.faults, np.array(self.joint_order), self.data.qpos, self.data.qvel
         self._tick += 1
-        trunk, joints = (qpos[3:7].copy(), qvel[3:6].copy()), (qpos[self._qpos], qvel[self._dofs], self._applied.copy())
-        joints[0][:1] += np.nan if faults.not_finite else 0.0
+        pos, vel = self._drives.measured(qpos[self._qpos], qvel[self._dofs])
+        pos[:1] += np.nan if faults.not_finite else 0.0
         hot, errors = np.isin(names, faults.hot), np.isin(names, faults.error)
-        state = RobotState(self._tick, *trunk, *joints, np.where(hot, 120.0, 40.0), errors.astype(int))
+        motors = (self._applied.copy(), np.where(hot, 120.0, 40.0), errors.astype(int))
+        state = RobotState(self._tick, qpos[3:7].copy(), qvel[3:6].copy(), pos, vel, *motors)
         self._late.append((self.data.time + faults.delay, state))
         if faults.silent or self._rng.random() < faults.lost:
             self._late.pop()

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from cyclonedds.idl import make_idl_struct
-from cyclonedds.idl.types import array, float32, int16, int32, uint8, uint16, uint32
+from cyclonedds.idl.types import array, byte, float32, int16, int32, uint16, uint32
 from numpy.typing import ArrayLike
 
 from legged_torque.runtime.interface import JOINT_ORDER, NO_POSITION, NO_VELOCITY, MotorCommand, RobotState
@@ -104,29 +104,30 @@ def _type(name: str, **members: Any) -> Any:
     return kind
 
 
+# Octets are ``byte``: with uint8, types have other hashes, at which Unitree's version of Cyclone DDS crashes.
 MotorCmd_ = _type(
-    "MotorCmd_", mode=uint8, q=float32, dq=float32, tau=float32, kp=float32, kd=float32, reserve=(uint32, 3)
+    "MotorCmd_", mode=byte, q=float32, dq=float32, tau=float32, kp=float32, kd=float32, reserve=(uint32, 3)
 )
-BmsCmd_ = _type("BmsCmd_", off=uint8, reserve=(uint8, 3))
+BmsCmd_ = _type("BmsCmd_", off=byte, reserve=(byte, 3))
 _TRUNK = {"quaternion": (float32, 4), "gyroscope": (float32, 3), "accelerometer": (float32, 3), "rpy": (float32, 3)}
-IMUState_ = _type("IMUState_", **_TRUNK, temperature=uint8)
+IMUState_ = _type("IMUState_", **_TRUNK, temperature=byte)
 _MOTOR = dict.fromkeys(("q", "dq", "ddq", "tau_est", "q_raw", "dq_raw", "ddq_raw"), float32)
-MotorState_ = _type("MotorState_", mode=uint8, **_MOTOR, temperature=uint8, lost=uint32, reserve=(uint32, 2))
+MotorState_ = _type("MotorState_", mode=byte, **_MOTOR, temperature=byte, lost=uint32, reserve=(uint32, 2))
 """Unitree names no error flags for Go2; here they are ``reserve[0]``."""
-_BATTERY = dict.fromkeys(("version_high", "version_low", "status", "soc"), uint8) | {"current": int32, "cycle": uint16}
-BmsState_ = _type("BmsState_", **_BATTERY, bq_ntc=(uint8, 2), mcu_ntc=(uint8, 2), cell_vol=(uint16, 15))
-_START = {"head": (uint8, 2), "level_flag": uint8, "frame_reserve": uint8}
+_BATTERY = dict.fromkeys(("version_high", "version_low", "status", "soc"), byte) | {"current": int32, "cycle": uint16}
+BmsState_ = _type("BmsState_", **_BATTERY, bq_ntc=(byte, 2), mcu_ntc=(byte, 2), cell_vol=(uint16, 15))
+_START = {"head": (byte, 2), "level_flag": byte, "frame_reserve": byte}
 _START |= {"sn": (uint32, 2), "version": (uint32, 2), "bandwidth": uint16}
-_OF_COMMANDS = {"motor_cmd": (MotorCmd_, SLOTS), "bms_cmd": BmsCmd_, "wireless_remote": (uint8, 40), "led": (uint8, 12)}
-_OF_COMMANDS |= {"fan": (uint8, 2), "gpio": uint8, "reserve": uint32, "crc": uint32}
+_OF_COMMANDS = {"motor_cmd": (MotorCmd_, SLOTS), "bms_cmd": BmsCmd_, "wireless_remote": (byte, 40), "led": (byte, 12)}
+_OF_COMMANDS |= {"fan": (byte, 2), "gpio": byte, "reserve": uint32, "crc": uint32}
 LowCmd_: type[Message] = _type("LowCmd_", **_START, **_OF_COMMANDS)
 """Command of a robot, on the topic rt/lowcmd.
 
 Unitree's programs leave ``reserve`` 0; ours number their messages there, from 1.
 """
 _OF_STATES = {"imu_state": IMUState_, "motor_state": (MotorState_, SLOTS), "bms_state": BmsState_}
-_OF_STATES |= {"foot_force": (int16, 4), "foot_force_est": (int16, 4), "tick": uint32, "wireless_remote": (uint8, 40)}
-_OF_STATES |= {"bit_flag": uint8, "adc_reel": float32, "temperature_ntc1": uint8, "temperature_ntc2": uint8}
+_OF_STATES |= {"foot_force": (int16, 4), "foot_force_est": (int16, 4), "tick": uint32, "wireless_remote": (byte, 40)}
+_OF_STATES |= {"bit_flag": byte, "adc_reel": float32, "temperature_ntc1": byte, "temperature_ntc2": byte}
 _OF_STATES |= {"power_v": float32, "power_a": float32, "fan_frequency": (uint16, 4), "reserve": uint32, "crc": uint32}
 LowState_: type[Message] = _type("LowState_", **_START, **_OF_STATES)
 """State of a robot, on the topic rt/lowstate."""
@@ -221,6 +222,7 @@ def encode_state(state: RobotState) -> Message:
     """
     message = LowState_()
     message["tick"] = state.tick * STATE_PERIOD % 2**32
+    message["version"], message["sn"] = state.identity.reshape(2, 2).tolist()
     message["imu_state.quaternion"] = _finite("quaternion", state.quaternion, 4).tolist()
     message["imu_state.gyroscope"] = _finite("angular_velocity", state.angular_velocity, 3).tolist()
     columns = {member: _finite(name, getattr(state, name)) for name, member in MEASURED.items()}
@@ -241,5 +243,6 @@ def decode_state(message: Message) -> RobotState:
         quaternion=_finite("quaternion", message["imu_state.quaternion"], 4),
         angular_velocity=_finite("angular_velocity", message["imu_state.gyroscope"], 3),
         errors=np.array(message["motor_state.reserve"], np.uint32),
+        identity=np.array([*message["version"], *message["sn"]]),
         **{name: _finite(name, message[f"motor_state.{member}"]) for name, member in MEASURED.items()},
     )

@@ -109,16 +109,16 @@ class Parser(argparse.ArgumentParser):
 def take_command(kind: str, names: Sequence[str]) -> str:
     """Make the first word a part of the program's name and return it; nothing before an option or a completion.
 
-    A UserError if it is not one of the names, which are those of a ``kind``.
+    A UserError if it is not one of the names, which are those of a ``kind``; "-" is as good as "_".
     """
-    name, is_completing = "".join(sys.argv[1:2]), "_ARGCOMPLETE" in os.environ
-    if name in names:
+    given, is_completing = "".join(sys.argv[1:2]), "_ARGCOMPLETE" in os.environ
+    if (name := given.replace("-", "_")) in names:
         sys.argv = [f"{sys.argv[0]} {name}", *sys.argv[2:]]
         if is_completing:  # one more word of the line belongs to the command
             os.environ["_ARGCOMPLETE"] = str(int(os.environ["_ARGCOMPLETE"]) + 1)
         return name
-    if name and not name.startswith("-") and not is_completing:
-        raise unknown_name(kind, name, names)
+    if given and not given.startswith("-") and not is_completing:
+        raise unknown_name(kind, given, names)
     return ""
 
 

@@ -9,6 +9,7 @@ import time
 from collections import deque
 from contextlib import contextmanager
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -18,6 +19,8 @@ from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
+from legged_torque import resource_path
+from legged_torque.runtime import motion_switcher
 from legged_torque.runtime import unitree_go2 as go2
 from legged_torque.runtime.dds import QUIET, WRITER, Go2Robot, Go2Side
 from legged_torque.runtime.interface import MotorCommand
@@ -37,7 +40,9 @@ for line in sys.stdin:  # numbers of the states to tell, 500 a second; of a nega
     start = time.monotonic()
     for k, number in enumerate(int(word) for word in line.split()):
         time.sleep(max(0.0, start + k / 500 - time.monotonic()))
-        message = unitree_go2.encode_state(RobotState(abs(number), np.zeros(4), np.zeros(3), *np.zeros((5, 12))))
+        firmware, tick = divmod(abs(number), 10_000)
+        measured = (np.zeros(4), np.zeros(3), *np.zeros((5, 12)), np.full(4, firmware))
+        message = unitree_go2.encode_state(RobotState(tick, *measured))
         message["crc"] ^= number < 0
         side.publish(message)
     heard = side.receive()
@@ -265,6 +270,32 @@ def test_slow_answers_of_the_motion_switcher(late):
         release.look([coming.popleft()[1] for due, _ in [*coming] if due <= now] if release.problem else [], now)
         assert release.problem or not service.name
     assert not release.problem and sent.count(1003) == 1
+
+
+@pytest.mark.parametrize("domain", [0, 230])
+def test_where_a_robot_need_not_have_a_motion_switcher(domain, monkeypatch):
+    """Not in the domain of Unitree's robots, whatever the interface."""
+    monkeypatch.setattr(motion_switcher, "ABSENT", 0.1)
+    transport = Go2Robot("lo", domain)
+    found = looks(transport, 0.3)
+    transport.close()
+    assert bool(found[-1].problems) == (domain == 0)
+
+
+def test_another_firmware(robot, transport):
+    """Is known by the first state, and a problem to the end once a state tells of another: the robot only damps."""
+    assert not any(look.problems for look in robot.told([2], transport)) and heard_of(robot, transport, 1.0) == 1.0
+    found = [look for number in (10_003, 4) for look in robot.told([number], transport)]
+    assert [look.newest.identity.tolist() for look in found if look.newest] == [[1] * 4, [0] * 4]
+    assert "firmware or serial number" in found[-1].problems[0]
+    assert heard_of(robot, transport, 0.0, 2.0) == 0.0
+
+
+def test_torque_limits():
+    """They are those of the bundled model."""
+    model = mujoco.MjModel.from_xml_path(str(resource_path("resources/robots/go2/go2.xml")))
+    known = zip(go2.JOINT_ORDER, Go2Robot.torque_limits, strict=True)
+    assert all(model.actuator(joint.removesuffix("_joint")).forcerange[1] == most for joint, most in known)
 
 
 def test_robots_that_start_anew_and_two_at_once(transport):

@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from support.command import command
 from support.exports import export_random
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 
@@ -25,6 +26,7 @@ from legged_torque.runtime.loop import PRIORITY
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
 from legged_torque.runtime.view import View
+from legged_torque.utils.errors import UserError
 
 RATE, DOMAIN, OTHER = 500.0, 200 + os.getpid() % 16, 216 + os.getpid() % 16
 SIDE = """
@@ -182,6 +184,53 @@ def test_scripts_without_torch(exported, tmp_path):
     command = [sys.executable, "-c", WITHOUT_TORCH % calls]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "") and "bit by bit" in done.stdout
+
+
+OWN = """
+from legged_torque import resource_path
+from legged_torque.runtime.in_process import InProcess
+from legged_torque.runtime.interface import JOINT_ORDER
+from legged_torque.runtime.sim_robot import SimRobot
+
+class Mine(InProcess):
+    torque_limits = [23.7, 23.7, 45.43] * 4
+
+    def __init__(self):
+        super().__init__(SimRobot(resource_path("resources/robots/go2/go2.xml"), JOINT_ORDER, 500.0))
+
+    def receive(self):
+        received = super().receive()
+        received.newest.identity[:] = 1, 2, 3, 4
+        return received
+"""
+
+
+def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
+    """Its name, its motors and what leads to it are checked before anything moves; its firmware is told once."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "own_robot.py").write_text(OWN)
+    own = ["deploy.py", str(exported), "--interface=own_robot.py:Mine"]
+    status, output, _ = run_here(*own, "--robot=go2", "--seconds=0.3", root=tmp_path)
+    assert (status, output.count("the robot's firmware is [1, 2], its serial number [3, 4]")) == (0, 1)
+    assert_told_in_one_line(run_here(*own, "--robot=a1", root=tmp_path), "--robot must be 'go2'")
+    assert_told_in_one_line(run_here(*own, "--domain=1", root=tmp_path), "FILE.py:CLASS do without")
+    for wrong in ("own_robot.py:Yours", "no_robot.py:Mine", "own-robot.py:Mine"):
+        assert_told_in_one_line(run_here(*own[:2], f"--interface={wrong}", root=tmp_path), f"has no '{wrong}'")
+    stronger = (resource_path("resources/robots/go2/go2.xml")).read_text("utf-8").replace("45.43", "200")
+    (tmp_path / "go2.xml").write_text(stronger)
+    export_random(make_task, "go2_torque_multihead", tmp_path / "out", **{"asset.file": str(tmp_path / "go2.xml")})
+    refused = run_here("deploy.py", "out", *own[2:], root=tmp_path)
+    assert_told_in_one_line(refused, "may ask FR_calf_joint for 200 N m, the robot's motor can give 45.43 N m")
+
+    def joined(interface, domain):
+        raise UserError(f"{interface} {domain}")
+
+    monkeypatch.setattr("legged_torque.runtime.dds.Go2Robot", joined)
+    for words, joins in ((["lo"], "lo 1"), (["eth0"], "eth0 0"), (["lo", "--domain=0"], "lo 0")):
+        words = ["deploy.py", str(exported), "--robot=go2", "--interface", *words]
+        assert_told_in_one_line(run_here(*words, root=tmp_path), joins)
+    status, output, _ = command("sim-robot", "--robot=go2", "--help")
+    assert status == 0 and output.startswith("usage: legged-torque sim_robot ")
 
 
 def test_scripts(make_task, exported, tmp_path):

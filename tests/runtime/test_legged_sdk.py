@@ -4,6 +4,7 @@ import sys
 from collections import deque
 from types import ModuleType, SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 from support.scripts import assert_told_in_one_line, run_here
@@ -73,6 +74,14 @@ def test_an_a1_stands_up(policy, sdk):
     assert robot._command.power == 3 and robot._safety.kind == "A1"
     sent = robot._udp.sent
     assert set(sent.q) == {2.146e9} and not sent.kp.any() and not sent.dq.any() and sent.kd.all()
+
+
+@pytest.mark.parametrize("name", ["a1", "go1"])
+def test_torque_limits(sdk, name):
+    """They are those of the bundled models."""
+    model = mujoco.MjModel.from_xml_path(str(resource_path(f"resources/robots/{name}/{name}.xml")))
+    known = zip(JOINT_ORDER, LeggedSdkRobot(name, power=1).torque_limits, strict=True)
+    assert all(model.actuator(joint.removesuffix("_joint")).forcerange[1] == most for joint, most in known)
 
 
 def test_torques_alone_silence_and_mistakes(exported, sdk, tmp_path, monkeypatch):

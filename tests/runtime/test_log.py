@@ -58,6 +58,23 @@ def test_what_was_written_is_read(policy, recorded):
     assert STAND < len(cut) < len(ticks) and cut[-1][0] == ticks[len(cut) - 1][0]
 
 
+def test_times_and_problems_of_ticks(policy, tmp_path):
+    """By how much each began after its time, for how long it took until its command was sent; what was wrong."""
+    controller, wire = Controller(policy, policy.joint_order, RATE), InProcess(robot_of(policy))
+    session, begins = Simulated(controller, wire, Log(tmp_path / "log.mcap", controller)), (7.0, 7.0025, 7.004, 7.0073)
+    for begin, session.took in zip((*begins, 7.0093), (1e-4, 2e-4, 1.5e-3, 0.0, 3e-4), strict=True):
+        receive = wire.receive
+        if begin == 7.0025:
+            wire.receive = lambda: Received(problems=["two programs send rt/lowstate"])
+        session.tick(begin, missed=begin == 7.0073)  # after which the next one is due a period later
+        wire.receive = receive
+    session.log.close()
+    ticks = [rest for *_, rest in RecordedLog(tmp_path / "log.mcap").ticks()]
+    np.testing.assert_allclose([rest["lateness"] for rest in ticks], [0.0, 5e-4, 0.0, 1.3e-3, 0.0], atol=1e-9)
+    np.testing.assert_allclose([rest["took"] for rest in ticks], [1e-4, 2e-4, 1.5e-3, 0.0, 3e-4], atol=1e-9)
+    assert [rest["problems"] for rest in ticks] == [[], ["two programs send rt/lowstate"], [], [], []]
+
+
 def test_the_policy_does_the_same(policy, recorded, make_task, tmp_path):
     """Its actions are the same, bit by bit; another policy is refused."""
     log = RecordedLog(recorded[0] / "log.mcap")

@@ -174,11 +174,17 @@ def test_keys(robot, monkeypatch):
                 (b"s\x1a", Mode.DAMPING, STILL),  # Ctrl-Z and Ctrl-\, which would halt or end the program
                 (b"s", Mode.STAND, STILL),
                 (b"\x1c", Mode.DAMPING, STILL),
+                (b",s", Mode.STAND, [0.0, 0.1, 0.0]),
+                (b"\x1bx\x1b[20~\x1b[20;5~\x1bOd\x1b\x1b[20~\x1bq", Mode.STAND, [0.0, 0.1, 0.0]),  # Alt+x, F9, ...
+                (b"\x1b[20", Mode.STAND, [0.0, 0.1, 0.0]),  # cut off
+                (b"\x1b \x1bs", Mode.DAMPING, [0.0, 0.1, 0.0]),  # a stop counts, whatever else is hit
+                (b"0\x1bs\x1b\x1b[A\x1b", Mode.DAMPING, STILL),
+                (b"s", Mode.STAND, STILL),
                 (b"x?q", Mode.PASSIVE, STILL),
             ):
                 os.write(master, keys)
                 keyboard.look()
-                assert [*does(robot)] == expected and keyboard.has_ended == (b"q" in keys)
+                assert [*does(robot)] == expected and keyboard.has_ended == keys.endswith(b"?q")
     os.close(master)
 
 
