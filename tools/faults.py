@@ -2,8 +2,7 @@
 
 Two processes, as ``sim_robot.py`` and ``deploy.py``: the robot, and a program that runs the exported policy. For each
 fault, at a random moment, the time is measured until a command arrives at the robot that only damps, or until its
-watchdog damps; and how far torques were asked for beyond their limits until then, in the state in which a command
-arrives.
+watchdog damps; and how far torques were asked for beyond their limits until then, in any physics step.
 """
 
 import multiprocessing as mp

@@ -278,7 +278,8 @@ def test_students():
     changed = ("240 million", "512 remembered", "8 epochs", "annealed from the start", "std 0.3", "24 steps")
     changed = [f"student, seed 2, {how}" for how in (*changed, "5 steps of history", "lstm")]
     lost = [less(crossed, policy, trained).max(axis=1)["a1", 2, 1000] for policy in changed]
-    assert f"an LSTM lost {lost.pop():.1f}%;" in text and f"lost {min(lost):.1f} to {max(lost):.1f}% (9b2b5d2" in text
+    assert f"an LSTM lost {lost.pop():.1f}%, seven other settings {min(lost):.1f} to {max(lost):.1f}% (9b2b5d2" in text
+    assert len(lost) == 7
     twice = less(crossed, "student, 240 million", trained).max(axis=1)
     assert len(twice) == 2 and (twice > equal.reindex(twice.index)).all()
     stones = pd.concat([less(tracked, policy, ["stepping_stones"])["stepping_stones"] for policy in seeds])
