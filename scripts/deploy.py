@@ -11,8 +11,8 @@ Keys: s stand up, p policy, d or space damping, x no torque, arrows, comma and p
 
 import argparse
 import contextlib
+import importlib
 import os
-import pkgutil
 import sys
 import threading
 import time
@@ -25,6 +25,7 @@ from typing import Annotated, Any
 from legged_torque import resource_path
 from legged_torque.utils import cli
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import importable
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.limits import Limits, Positive, Rate
 
@@ -100,7 +101,7 @@ def main() -> None:
         """Write the log and draw the view, in a thread of its own: a disk or a terminal may keep that waiting."""
         with contextlib.suppress(OSError, AttributeError):  # as other programs, after the loop
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        identity = [0] * 4
+        identity = [0] * 4  # of those that do not tell theirs
         while not ended.wait(POLL):
             if log:
                 log.write()
@@ -182,12 +183,13 @@ def outside(args: argparse.Namespace, trained: str) -> Any:
     """Return the transport to a robot outside of this process, of the name with which a policy was trained."""
     if ".py:" in args.interface:  # code of the user's, who names it here
         file, _, name = args.interface.rpartition(":")
-        sys.path.append(str(Path(file).absolute().parent))
-        try:
-            kind = pkgutil.resolve_name(f"{Path(file).stem}:{name}")
-        except (ImportError, AttributeError, ValueError) as error:
-            raise UserError(f"--interface FILE.py:CLASS has no '{args.interface}': {error}") from None
-        return kind()
+        kind = getattr(importlib.import_module(importable(Path(file), "--interface FILE.py:CLASS")), name, None)
+        if not isinstance(kind, type):
+            raise UserError(f"'{file}' has no class '{name}'")
+        transport = kind()
+        if len(getattr(transport, "torque_limits", [])) != len(getattr(transport, "joint_order", [""])):
+            raise UserError(f"'{args.interface}' must have joint_order and as many torque_limits")
+        return transport
     if args.interface == "sdk":
         from legged_torque.runtime.legged_sdk import LeggedSdkRobot
 

@@ -54,6 +54,8 @@ def main() -> None:
             load_pyplot()  # a UserError if it is missing
     log, policy = RecordedLog(args.log), Policy(args.policy)
     hangs = log.sha256 == CHECKSUM  # sweeps in place of a policy
+    if hangs and log.task != (task := policy.description["task"]):
+        raise UserError(f"the log is of the task '{log.task}', the policy of '{task}'")
     if not hangs:
         steps, equal = same_actions(log, policy)
         print(f"policy: {equal} of {steps} steps have the same actions, bit by bit")

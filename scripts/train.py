@@ -37,7 +37,7 @@ from legged_torque.viewer.training_viewer import TrainingViewer
 if TYPE_CHECKING:
     from legged_torque.learning.runner import OnPolicyRunner
 
-LONG_ON_CPU = 50_000_000  # steps, which take an hour or more
+LONG_ON_CPU = 50_000_000  # steps, which take hours with the networks of other presets than laptop
 
 
 def main() -> None:
@@ -118,7 +118,7 @@ def new_settings(options: Options) -> tuple[Any, Any]:
 
 
 def length_note(train_cfg: Any) -> str:
-    """Return that a training takes hours on a CPU, and what takes less if its task has that; empty if it does not."""
+    """Return the note that a training takes hours on a CPU, and what takes less; empty if it is not that long."""
     shorter = f"--preset {CPU_PRESET} takes minutes, and " if CPU_PRESET in train_cfg.presets() else ""
     note = f"this training takes hours on a CPU; {shorter}Ctrl-C keeps the run"
     return note if train_cfg.runner.total_steps >= LONG_ON_CPU else ""

@@ -13,7 +13,7 @@ from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, refuse
 from legged_torque.utils.heading import heading
 
-LARGEST_ACTION = 100.0  # times the clip, or 1 if that is less: saturated networks say some times the clip, not this
+LARGEST_ACTION = 100.0  # times the clip, where one below 1 counts as 1: saturated networks say some times the clip
 IN_OLD_NETWORKS = ("joint_order", "nominal_pose", "observations", "actions")
 """Sections that networks hold which were exported before all sections were stored."""
 
@@ -130,8 +130,9 @@ class Policy:
             raise UserError("the network's actions are not finite: check the observations")
         worst, largest = int(np.abs(actions).argmax()), LARGEST_ACTION * max(1.0, *np.abs(self._action_clip))
         if abs(action := actions[0, worst]) > largest:
-            joint = self.joint_order[worst % len(self.joint_order)]
-            raise UserError(f"the network's action for {joint} is {action:.4g}, beyond {largest:g}")
+            term, joint = divmod(worst, len(self.joint_order))
+            which = f"{self._action_terms[term]['name']} of {self.joint_order[joint]}"
+            raise UserError(f"the network's {which} is {action:.4g}, beyond {largest:g}")
         new = np.clip(actions[0], *self._action_clip)
         is_due = np.repeat([self.phase(term["name"]) == 0.0 for term in self._action_terms], len(self.joint_order))
         self.last_action = np.where(is_due, new, self.last_action)

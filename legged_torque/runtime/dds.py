@@ -140,8 +140,8 @@ class Go2Robot(_Side):
     mode is not released, that is a problem, and no command is sent. Its service must answer in domain 0, that of
     Unitree's robots; in others it may be missing, as in unitree_mujoco. A new sender of states is asked anew. Until it
     answers, damping is sent: it may be another program next to a robot that walks. While another program commands the
-    robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun. So are another
-    firmware or serial number than at first, to the end.
+    robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun. It listens before.
+    So are another firmware or serial number than at first, to the end.
     """
 
     torque_limits = [23.7, 23.7, 45.43] * 4  # of hips, thighs and calves [N m]
@@ -153,9 +153,9 @@ class Go2Robot(_Side):
         super().__init__(interface, domain)
         self._sent, self._release = 0, Release(self._service_writer.write, is_optional=domain != 0)
         self._others = DataReader(self._participant, self._writer.topic, READER)  # commands that are not this program's
-        self._others_heard, self._problems = -math.inf, [self._release.problem]
+        self._joined, self._others_heard = time.monotonic(), -math.inf
         self._identity: Any = None  # of the first state
-        self._exchanged = ""
+        self._exchanged, self._problems = "", [self._release.problem]
 
     def receive(self) -> Received:
         """Return what has come, and ask for what is missing."""
@@ -167,11 +167,13 @@ class Go2Robot(_Side):
         now = time.monotonic()
         if _taken(self._others):
             self._others_heard = now
-        others = f"another program sends {TOPICS[LowCmd_]}" if now - self._others_heard < QUIET else ""
+        others = "" if now - self._joined > QUIET else "listening for other programs"
+        if now - self._others_heard < QUIET:
+            others = f"another program sends {TOPICS[LowCmd_]}"
         if isinstance(state := received.newest, RobotState):
             self._identity = state.identity if self._identity is None else self._identity
             if (state.identity != self._identity).any():
-                self._exchanged = "the robot's firmware or serial number is not that of its first state: start anew"
+                self._exchanged = "another firmware or serial number than in the first state: start deploy.py anew"
         self._problems = [problem for problem in (self._release.problem, others, self._exchanged) if problem]
         received.problems += self._problems
         return received
@@ -182,6 +184,11 @@ class Go2Robot(_Side):
         if not self._problems or (self._sent and is_damping and not self._release.mode):
             self._sent = self._sent % (NUMBERS - 1) + 1  # never 0
             self.publish(unitree_go2.encode_command(command, self._sent))
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._others = None
+        super().close()
 
 
 class Go2Side(_Side):

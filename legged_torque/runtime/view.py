@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from legged_torque.runtime.brakes import tilt_of
+from legged_torque.runtime.controller import OPERATOR
 from legged_torque.runtime.interface import RobotState
 from legged_torque.runtime.loop import RealTimeLoop
 from legged_torque.runtime.operator import Operator
@@ -69,7 +70,7 @@ class View:
     def table(self) -> Group:
         """Return that line, and a row for each joint."""
         controller, state = self._session.controller, self._session.controller.state
-        head = Text(self.line(), "bold red" if controller.reason else "bold")
+        head = Text(self.line(), "bold red" if controller.reason not in ("", OPERATOR) else "bold")
         if state is None:
             return Group(head)
         table = Table("joint", "rad", "rad/s", "N m", "of the limit", "deg C", "error", box=None)

@@ -2,17 +2,39 @@
 
 import contextlib
 import fcntl
+import importlib.util
 import json
 import math
 import os
 import re
 import shutil
+import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from legged_torque.utils.errors import UserError
+
+
+def importable(file: Path, option: str) -> str:
+    """Return the name of the module that a Python file is, with its folder as the last place to import from.
+
+    A UserError says why the file, which was given as an ``option``, cannot be imported.
+    """
+    name, path = file.stem, file.absolute()
+    if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
+        raise UserError(f"{option} takes a Python file with the name of a module, not '{file}'")
+    if name in sys.modules:
+        other = getattr(sys.modules[name], "__file__", None) or name  # Python's own have none
+    else:
+        spec = importlib.util.find_spec(name)
+        other = spec.origin if spec else None  # of a folder, too
+    if other and Path(other).resolve() != path.resolve():
+        raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
+    if name not in sys.modules:
+        sys.path.append(str(path.parent))
+    return name
 
 
 @contextlib.contextmanager

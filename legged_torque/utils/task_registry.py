@@ -25,7 +25,7 @@ from legged_torque.utils import distributed, runs
 from legged_torque.utils.config import BaseConfig
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, printable, unknown_name
-from legged_torque.utils.files import remove_stale_parts
+from legged_torque.utils.files import importable, remove_stale_parts
 from legged_torque.utils.options import Options, apply_options
 from legged_torque.utils.policies import policy_dir
 
@@ -97,18 +97,8 @@ class TaskRegistry:
         it, and settings may name its classes, ``"my_task:MyRobot"``. A UserError says why a file cannot be used.
         """
         for file in map(Path, files):
-            name, path = file.stem, file.absolute()
-            if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
-                raise UserError(f"--task_file takes a Python file with the name of a module, not '{file}'")
-            if name in sys.modules:
-                other = getattr(sys.modules[name], "__file__", None) or name  # Python's own have none
-            else:
-                spec = importlib.util.find_spec(name)
-                other = spec.origin if spec else None  # of a folder, too
-            if other and Path(other).resolve() != path.resolve():
-                raise UserError(f"'{file}' cannot be imported: there is another module '{name}'; rename the file")
+            name = importable(file, "--task_file")
             if name not in sys.modules:
-                sys.path.append(str(path.parent))
                 with self._adding(f"'{file}'"):
                     importlib.import_module(name)
 

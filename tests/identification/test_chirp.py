@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.exports import export_random
-from support.scripts import run_here
+from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 from support.simulated import Simulated
 
@@ -70,6 +70,10 @@ def test_hanging_robot(exported, policy, tmp_path):
     assert len(measured) == SECONDS * RATE and (np.ptp(measured[:, 0], axis=0) > 0.3).all()
     status, said, _ = run_here("replay.py", "log.mcap", f"--policy={exported}", root=tmp_path)
     assert status == 0 and said.count("never; 0.0000") == 12 and "bit by bit" not in said
+    sweeps.description["task"] = "a1_position"
+    Log(tmp_path / "other.mcap", controller).close()
+    refused = run_here("replay.py", "other.mcap", f"--policy={exported}", root=tmp_path)
+    assert_told_in_one_line(refused, "the log is of the task 'a1_position', the policy of 'go2_torque_multihead'")
 
 
 def test_refused(policy, monkeypatch):

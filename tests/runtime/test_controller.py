@@ -322,7 +322,7 @@ def test_actions_out_of_range(policy, monkeypatch, clip, largest):
         for asked in (Mode.STAND, Mode.POLICY):
             assert world.controller.request(asked) == ""
             end = world.run(10)
-        said = f"the network's action for RL_calf_joint is {number:.4g}, beyond {largest:g}"
+        said = f"the network's torque of RL_calf_joint is {number:.4g}, beyond {largest:g}"
         assert (end, world.stops) == (mode, [said] * (mode == Mode.DAMPING))
 
 

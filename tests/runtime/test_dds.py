@@ -277,7 +277,7 @@ def test_where_a_robot_need_not_have_a_motion_switcher(domain, monkeypatch):
     """Not in the domain of Unitree's robots, whatever the interface."""
     monkeypatch.setattr(motion_switcher, "ABSENT", 0.1)
     transport = Go2Robot("lo", domain)
-    found = looks(transport, 0.3)
+    found = looks(transport, QUIET + 0.1)
     transport.close()
     assert bool(found[-1].problems) == (domain == 0)
 

@@ -38,7 +38,7 @@ def test_lateness_is_that_of_the_loop(policy, tmp_path):
     for share in (0.5, 0.8, 0.95):
         of_log = np.sort(late[: loop.ticks])[int(np.ceil(share * loop.ticks)) - 1]
         assert loop.lateness(share) - 3 * BIN < of_log < loop.lateness(share) + BIN
-    assert max(late[loop.ticks :]) < 0.05  # of the farewell, which has no loop
+    assert max(late[loop.ticks :]) < 0.2  # of the farewell, which has no loop
 
 
 def test_a_halt_between_two_ticks_is_noticed():
