@@ -35,7 +35,7 @@ LINES = {
     "legged_torque/sensors": 305,
     "legged_torque/sim": 5940,
     "legged_torque/terrain": 586,
-    "legged_torque/utils": 3454,
+    "legged_torque/utils": 3453,
     "legged_torque/viewer": 2496,
     "scripts": 2115,
     "paper": 3240,
@@ -43,7 +43,7 @@ LINES = {
     "tests": 26389,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_876  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_875  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

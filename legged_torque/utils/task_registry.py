@@ -10,7 +10,6 @@ import contextlib
 import copy
 import importlib
 import importlib.metadata
-import importlib.util
 import math
 import pkgutil
 import sys
