@@ -36,9 +36,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, help="end after this time; default: with Ctrl-C")
     parser.add_argument("--motors", default="ideal", help="ideal, real, ..., or a file of identify.py; default: ideal")
     parser.add_argument("--latency", type=float, help="of commands [ms]; default: that of a file of motors, or 0")
-    hint = (
-        "lost, damaged (shares of messages), delay [s], push [m/s], silent=1; dead, hot or error=JOINT; may be repeated"
-    )
+    hint = "lost, damaged (shares of messages), delay [s], push [m/s], silent=1; dead, hot or error=JOINT; "
+    hint += "may be repeated"
     parser.add_argument("--fault", action="append", default=[], metavar="NAME=VALUE", help=hint)
     parser.add_argument("--fault_at", type=float, default=0.0, help="second at which faults begin; default: at once")
     parser.add_argument("--viewer", action="store_true", help="show it in MuJoCo's window, where the mouse pushes it")
@@ -65,7 +64,7 @@ def main() -> None:
     robot = SimRobot(resource_path(cfg.asset.file), side.joint_order, RATE, **motors)
     faults, start = with_faults(Faults(), args.fault, side.joint_order), time.monotonic()
 
-    def tick(now: float, missed: bool) -> None:
+    def tick(now: float, *_: float) -> None:
         """Obey, move, and tell the state."""
         if now - start >= args.fault_at:
             robot.faults = faults

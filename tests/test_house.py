@@ -31,19 +31,19 @@ LINES = {
     "legged_torque/importer": 1252,
     "legged_torque/learning": 4288,
     "legged_torque/motors": 1525,
-    "legged_torque/runtime": 2201,
+    "legged_torque/runtime": 2197,
     "legged_torque/sensors": 305,
     "legged_torque/sim": 5940,
     "legged_torque/terrain": 586,
     "legged_torque/utils": 3453,
     "legged_torque/viewer": 2496,
-    "scripts": 2115,
+    "scripts": 2114,
     "paper": 3240,
     "tools": 1505,
-    "tests": 26389,
+    "tests": 26388,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_875  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_870  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

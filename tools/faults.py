@@ -138,7 +138,7 @@ class Robot:
             if time.monotonic() > end:
                 raise TimeoutError("the robot's loop has ended")
 
-    def tick(self, now: float, missed: bool) -> None:
+    def tick(self, *_: float) -> None:
         """Obey, move, and tell the state."""
         if self._change is not None:
             self._change(self.robot)

@@ -141,7 +141,7 @@ class Go2Robot(_Side):
     Unitree's robots; in others it may be missing, as in unitree_mujoco. A new sender of states is asked anew. Until it
     answers, damping is sent: it may be another program next to a robot that walks. While another program commands the
     robot, that is a problem, too: then damping is sent, or nothing by a program that has not begun. It listens before.
-    So are another firmware or serial number than at first, to the end.
+    Another firmware or serial number than that of the first state is a problem to the end.
     """
 
     torque_limits = [23.7, 23.7, 45.43] * 4  # of hips, thighs and calves [N m]

@@ -27,8 +27,8 @@ class RealTimeLoop:
     ticks = 0
     error: BaseException | None = None
 
-    def __init__(self, rate: float, tick: Callable[[float, bool], None]) -> None:
-        """Prepare to call ``tick`` with the time [s] and whether it is late, ``rate`` a second."""
+    def __init__(self, rate: float, tick: Callable[[float, bool, float], None]) -> None:
+        """Prepare to call ``tick`` ``rate`` times a second: with the time, whether it is late, and by how much [s]."""
         self._period, self._tick, self._ended = 1.0 / rate, tick, threading.Event()
         self._histogram = np.zeros(BINS, np.int64)
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
@@ -70,7 +70,7 @@ class RealTimeLoop:
                 self._histogram[min(int(late / BIN), BINS - 1)] += 1
                 self.ticks += 1
                 due = (begin if missed else due) + self._period  # what was missed is not caught up
-                self._tick(begin, missed)
+                self._tick(begin, missed, late)
         except BaseException as error:
             self.error = error
 

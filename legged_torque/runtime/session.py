@@ -30,14 +30,11 @@ class Session:
         ``clock`` returns the time [s] that ticks are given: a test's robot has a time of its own.
         """
         self.controller, self._transport, self.log, self._clock = controller, transport, log, clock
-        self._due: float | None = None  # when the next tick should begin [s]
         self.counts: Counter[str] = Counter()
         self.stops: list[str] = []
 
-    def tick(self, now: float, missed: bool) -> None:
+    def tick(self, now: float, missed: bool, late: float = 0.0) -> None:
         """Listen, decide, and tell the drives; see :class:`~legged_torque.runtime.loop.RealTimeLoop`."""
-        late = 0.0 if self._due is None else now - self._due
-        self._due = (now if missed else now - late) + self.controller.period  # as the loop's
         try:
             received = self._transport.receive()
         except Exception as error:  # whatever it is, the robot must be told to damp
@@ -65,7 +62,6 @@ class Session:
             error: BaseException | None = None
             while time.monotonic() < end:
                 try:
-                    self._due = self._clock() + self.controller.period  # no loop gives the times of these ticks
                     time.sleep(self.controller.period)
                     self.tick(self._clock(), missed=False)
                 except BaseException as failure:  # the next message may arrive, also after Ctrl-C

@@ -77,9 +77,8 @@ def test_one_ends_before_all_have_joined(tmp_path):
     (tmp_path / "both.py").write_text(text)
     how = {"env": os.environ | PATHS, "text": True, "capture_output": True, "timeout": 60}
     done = subprocess.run([*COMMAND, tmp_path / "both.py"], **how)
-    assert_told_in_one_line(
-        (done.returncode, done.stdout, done.stderr), "another process has ended before the training began"
-    )
+    result = done.returncode, done.stdout, done.stderr
+    assert_told_in_one_line(result, "another process has ended before the training began")
 
 
 SHORTER = " --preset laptop takes minutes, and"
@@ -88,7 +87,7 @@ LONG = [("a1_position", "parallel", SHORTER), ("a1_position", "flashsac", SHORTE
 
 @pytest.mark.parametrize(("task", "preset", "shorter"), LONG)
 def test_long_trainings(task, preset, shorter):
-    """What takes hours on a CPU is told before it begins, with the shorter preset where a task has it."""
+    """A note says that a training takes hours on a CPU, and names the preset laptop where a task has it."""
     note = runpy.run_path(str(ROOT / "scripts" / "train.py"))["length_note"]
     said = note(task_registry.get_cfgs(task, Options(task=task, preset=preset))[1])
     assert said == f"this training takes hours on a CPU;{shorter} Ctrl-C keeps the run"

@@ -209,7 +209,7 @@ class Older(Mine):
 
 
 def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
-    """Its name, its motors and what leads to it are checked before anything moves; its firmware is told once."""
+    """The robot's name, torque limits and transport are checked before anything moves; its firmware is printed once."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "own_robot.py").write_text(OWN)
     own = ["deploy.py", str(exported), "--interface=own_robot.py:Mine"]

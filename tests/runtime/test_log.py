@@ -62,11 +62,12 @@ def test_times_and_problems_of_ticks(policy, tmp_path):
     """By how much each began after its time, for how long it took until its command was sent; what was wrong."""
     controller, wire = Controller(policy, policy.joint_order, RATE), InProcess(robot_of(policy))
     session, begins = Simulated(controller, wire, Log(tmp_path / "log.mcap", controller)), (7.0, 7.0025, 7.004, 7.0073)
+    late = dict(zip(begins, (0.0, 5e-4, 0.0, 1.3e-3), strict=True))
     for begin, session.took in zip((*begins, 7.0093), (1e-4, 2e-4, 1.5e-3, 0.0, 3e-4), strict=True):
         receive = wire.receive
         if begin == 7.0025:
             wire.receive = lambda: Received(problems=["two programs send rt/lowstate"])
-        session.tick(begin, missed=begin == 7.0073)  # after which the next one is due a period later
+        session.tick(begin, begin == 7.0073, late.get(begin, 0.0))  # after which the next one is due a period later
         wire.receive = receive
     session.log.close()
     ticks = [rest for *_, rest in RecordedLog(tmp_path / "log.mcap").ticks()]

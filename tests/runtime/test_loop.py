@@ -26,8 +26,8 @@ def test_lateness_is_that_of_the_loop(policy, tmp_path):
     controller, wire = Controller(policy, policy.joint_order, RATE), InProcess(robot_of(policy))
     session = Session(controller, wire, Log(tmp_path / "log.mcap", controller))
 
-    def tick(now, missed):
-        session.tick(now, missed)
+    def tick(*about):
+        session.tick(*about)
         time.sleep(0.0035 if loop.ticks % 7 == 0 else 0.0)
 
     with RealTimeLoop(RATE, tick) as loop:
@@ -46,7 +46,7 @@ def test_a_halt_between_two_ticks_is_noticed():
     code = "import sys; from legged_torque.runtime.loop import RealTimeLoop; ticks = []\n"
     code += "with RealTimeLoop(20.0, lambda *tick: ticks.append(tick)):\n"
     code += "    print('ready', flush=True); sys.stdin.readline()\n"
-    code += "print(*(f'{now} {missed:d}' for now, missed in ticks), sep='\\n')"
+    code += "print(*(f'{now} {missed:d}' for now, missed, _ in ticks), sep='\\n')"
     with subprocess.Popen([sys.executable, "-c", code], stdin=PIPE, stdout=PIPE, text=True) as program:
         assert program.stdout.readline() == "ready\n"
         time.sleep(0.3)

@@ -27,10 +27,10 @@ class Simulated(Session):
     def __init__(self, *args):
         super().__init__(*args, clock=lambda: self.now + self.took)
 
-    def tick(self, now, missed):
+    def tick(self, now, missed, late=0.0):
         """A tick of that time."""
         self.now = now
-        super().tick(now, missed)
+        super().tick(now, missed, late)
 
 
 class World(Simulated):
