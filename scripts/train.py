@@ -173,7 +173,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False
-    stopwatch.lap("networks and evaluations' worlds")
+    stopwatch.lap("trainer")
     try:
         runner.learn(remaining, init_at_random_ep_len=True)
         is_complete = not runner.stopped_by

@@ -29,7 +29,7 @@ def test_start():
     """Seconds until the first iteration has ended, and of compiling kernels."""
     start = next(each for each in DATA if "warm" in each)
     text, stages = text_of("performance.md", "- **Start.**"), ["imports and settings", "task", "first iteration"]
-    stages.append("networks and evaluations' worlds")
+    stages.append("trainer")
     until = [sum(times[stage] for stage in stages) for times in (start["warm"][0], start["cold"])]
     assert "{:.0f} s pass with warm caches and {:.0f} s".format(*until) in text
     parts = [start["warm"][0][stage] for stage in stages[:3]]

@@ -14,7 +14,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.metrics import measure
 from legged_torque.envs.base.sweep import NUM_PARTS, REST, WATCHED, PushSweep, Sweep
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.options import PUSH, draw_only
+from legged_torque.utils.options import CONTACT, PUSH, draw_only
 
 QUICK = {"domain_rand.resampling_probability": 0.2, "env.episode_length_s": 0.3, "commands.resampling_probability": 0.0}
 
@@ -101,6 +101,10 @@ def test_both_numbers_of_contacts(changed, make_task):
     one = make_task("a1_position", 2, **{"domain_rand.randomize_parameters": True, "domain_rand.contact_stiffness": {}})
     assert Sweep(one, "contact_damping").edges[0] == 72.0
     assert error_of(Sweep, one, "contact_stiffness").endswith("that of contact_damping: sweep contact_damping")
+    neither = {f"domain_rand.{name}": {} for name in CONTACT}
+    fixed = make_task("a1_position", 2, **{"domain_rand.randomize_parameters": True, **neither})
+    for name in CONTACT:  # as above, a range of its own is enough
+        assert error_of(Sweep, fixed, name).endswith(f": give domain_rand.{name} a range with --set")
 
 
 def test_links_that_do_not_exist(make_task):

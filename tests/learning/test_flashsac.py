@@ -213,9 +213,13 @@ def test_mistakes(tmp_path, change, told):
     assert not [*tmp_path.rglob("config.yaml")]
 
 
-def test_settings_of_flashsac_are_refused_with_ppo():
-    """PPO would not read them."""
+def test_settings_of_other_learners_are_refused():
+    """PPO would not read those of FlashSAC; only PPO has a critic that can learn first."""
     assert "flashsac.n_steps is not read" in error_of(get_cfgs, "--set=flashsac.n_steps=1")
+    warmup = "pretraining.critic_warmup_iterations"
+    assert get_cfgs(f"--set={warmup}=5")[1].pretraining.critic_warmup_iterations == 5
+    for preset in ("flashsac", "student"):
+        assert error_of(get_cfgs, f"--preset={preset}", f"--set={warmup}=5").startswith(f"{warmup} is not read by ")
 
 
 @pytest.mark.parametrize("copies", [(), (2,)])
@@ -299,14 +303,18 @@ def test_projection():
 
 
 def test_reward_scale():
-    """It is the larger of the deviation of all returns and the largest one over the bound, of each episode alone."""
+    """It is the larger of the deviation of all returns and the largest one over the bound, of each episode alone.
+
+    A reward that is not finite counts as 0.
+    """
     rng = np.random.default_rng(0)
     rewards, dones = rng.normal(0.5, 1.0, (50, 4)), rng.random((50, 4)) < 0.1
+    rewards[[5, 20, 35], [0, 1, 2]] = math.nan, math.inf, -math.inf
     for bound in (1.0, 100.0):
         ours, running, now, returns = RewardScale(0.9, bound), torch.zeros(4), np.zeros(4), []
         for reward, done in zip(rewards, dones, strict=True):
             ours.follow(running, torch.tensor(reward, dtype=torch.float32), torch.tensor(done))
-            now = 0.9 * now + reward
+            now = 0.9 * now + np.where(np.isfinite(reward), reward, 0.0)
             returns.append(now)
             now = np.where(done, 0.0, now)
         assert float(ours.scale()) == pytest.approx(max(np.std(returns), np.abs(returns).max() / bound), rel=1e-5)

@@ -12,6 +12,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
+from support.runners import build_runner
 from support.scripts import COMMAND, PATHS, assert_told_in_one_line, run_here
 
 from legged_torque.envs import task_registry
@@ -142,3 +143,15 @@ def test_when_it_walks(capsys):
             clock.sleep(1.0)
             display.add_iteration(i + 1, 1000 * i + 300_000, {})
     assert "steps/s" in (output := capsys.readouterr().out) and "walks" not in output
+
+
+WHERE = [("a1_torque_multihead", 256, True), ("a1_torque_multihead", 64, False)]
+WHERE += [("a1_rough_torque_multihead", 256, False), ("a1_multihead_two_rates", 256, False)]
+
+
+@pytest.mark.parametrize(("task", "worlds", "is_known"), WHERE)
+def test_where_it_is_known_when_it_walks(make_task, tmp_path, capsys, task, worlds, is_known):
+    """It was measured on a plane, in 256 worlds and at 50 Hz; a training elsewhere does not tell."""
+    build_runner(make_task, task, worlds, log_root=tmp_path, **{"runner.walks_after": 4_000_000}).learn(2)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert "steps/s" in last and ("an A1 walks in" in last) == is_known

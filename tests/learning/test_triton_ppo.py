@@ -99,10 +99,21 @@ def test_learning_rate_follows_the_divergence():
     assert float(algorithms[1].learning_rate) < 1e-2
 
 
+def test_updates_are_those_of_torch():
+    """Whole updates learn from the same samples in the same order: rates follow each minibatch's divergence."""
+    algorithms = plain, fused = pair(sizes=NARROW, schedule="adaptive", learning_rate=1e-3, desired_kl=0.01)
+    for alg in algorithms:
+        torch.manual_seed(5)
+        assert alg.update()["skipped_updates"] == 0.0
+    assert steps_taken(plain) == steps_taken(fused) == plain.num_learning_epochs * plain.num_mini_batches > 2
+    for own, other in zip(parameters(fused).values(), parameters(plain).values(), strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-3, atol=2e-5)
+
+
 def learn(alg, firsts):
     """Learn from minibatches that begin at these samples of a rollout."""
     for first in firsts:
-        alg.indices.copy_(torch.arange(first, first + alg.batch_size))
+        alg.choose(torch.arange(first, first + alg.batch_size))
         alg.update_minibatch()
 
 

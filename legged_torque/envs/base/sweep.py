@@ -37,9 +37,10 @@ class Sweep:
         drawn = next((kind for kind in kinds if name in kind.sizes), None)
         if drawn is None:
             draws = {each.name: each.same_draw_as or each.name for kind in kinds for each in kind.parameters}
-            for other in (listed for kind in kinds for listed in kind.sizes if draws[listed] == draws.get(name)):
+            same = (each for kind in kinds for each in kind.parameters if draws[each.name] == draws.get(name))
+            if other := next((each.name for each in same if each.is_drawn), None):
                 raise UserError(f"{name} has no draw of its own, but that of {other}: sweep {other}")
-            raise UserError(f"{name} is always 0: give {setting} a range with --set")
+            raise UserError(f"{name} is {'fixed' if name in draws else 'always 0'}: give {setting} a range with --set")
         if drawn.sizes[name] > 1:
             raise UserError(f"--sweep takes parameters with one number per world; {name} has {drawn.sizes[name]}")
         place, low, high = drawn.range_of(name)

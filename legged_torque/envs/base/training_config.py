@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 CODE_NAMES = ("class_name", "function", "_func")
 """Ends of the names of settings that name a class or a function, ``"module:Class"`` or a name in rsl_rl."""
 PPO = "legged_torque.learning.ppo:OnDevicePPO"
-SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.", "pretraining.file")  # of learners
+SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.", "pretraining.file", "pretraining.critic")
 READ = {
-    PPO: ("algorithm.", "actor.", "critic.", "pretraining.file"),
+    PPO: ("algorithm.", "actor.", "critic.", "pretraining.file", "pretraining.critic_warmup_iterations"),
     FLASHSAC: (
         "flashsac.",
         *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision", "symmetry_cfg.")),
@@ -47,9 +47,7 @@ class TrainingCfg(BaseConfig):
             most = f"at most algorithm.max_learning_rate, {rate.max_learning_rate}"
             raise UserError(f"algorithm.learning_rate must be {most}, not {rate.learning_rate}")
         if cfg.pretraining.file and not cfg.pretraining.function:
-            raise UserError(
-                "pretraining.file is set, but nothing starts from it: the task's pretraining.function is empty"
-            )
+            raise UserError("pretraining.file is set, but nothing starts from it: pretraining.function is empty")
         for key in ("run_name", "experiment_name"):
             value = getattr(cfg.runner, key)
             if value and (Path(value).name != value or value == ".." or not value.isprintable()):

@@ -26,7 +26,7 @@ class RewardScale(nn.Module):
 
     def follow(self, returns: Tensor, rewards: Tensor, dones: Tensor) -> None:
         """Let statistics and ``returns``, those so far of the present episodes, follow a step. Shapes: (num_envs,)."""
-        returns.mul_(self.gamma).add_(rewards)
+        returns.mul_(self.gamma).add_(torch.where(rewards.isfinite(), rewards, 0.0))  # NaN would stay for good
         self.largest_return.copy_(torch.maximum(self.largest_return, returns.abs().max()))
         var, mean = torch.var_mean(returns.double(), correction=0)
         share = len(returns) / (self.count + len(returns))
