@@ -39,7 +39,7 @@ LINES = {
     "legged_torque/viewer": 2496,
     "scripts": 2114,
     "paper": 3240,
-    "tools": 1666,
+    "tools": 1665,
     "tests": 26510,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""

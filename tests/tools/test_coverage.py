@@ -1,0 +1,86 @@
+"""Logs with known numbers against another simulation of them, and what is counted of fits whose errors are known."""
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.one_leg import NOISE, POSE, TRUTH, one_leg, record, sweep
+from support.scripts import assert_told_in_one_line, run_here
+
+from legged_torque.deploy.policy import Policy
+from legged_torque.utils.errors import UserError
+from tools import coverage
+
+
+def test_simulation(tmp_path):
+    """Short semi-implicit steps, in which drives compute torques themselves, go to the same places."""
+    expected = record(one_leg(tmp_path), sweep(0.6), step=5e-5, half=0.5)
+    measured = coverage.simulate(tmp_path / "fixed.xml", list(POSE), expected.commands, TRUTH)
+    np.testing.assert_allclose(measured[:, 0], expected.measured[:, 0], atol=2e-5)
+    np.testing.assert_allclose(measured[:, 1], expected.measured[:, 1], atol=2e-3)
+    assert np.ptp(measured[:, 0], axis=0).min() > 0.1
+
+
+def test_noise_and_numbers(monkeypatch):
+    """Trials differ, and repeat themselves; encoders have the noise of the documentation, and biases either sign."""
+    policy = Policy("go2/torque_multihead")
+    logs, truths = zip(*(coverage.make_log(policy, 0.5, trial) for trial in (0, 0, 1)), strict=True)
+    monkeypatch.setattr(coverage, "NOISE", 0.0)
+    noise = logs[0].measured - coverage.make_log(policy, 0.5, 0)[0].measured
+    np.testing.assert_allclose(noise.std(axis=(0, 2)), NOISE[:, 0], rtol=0.05)
+    np.testing.assert_array_equal(logs[0].measured, logs[1].measured)
+    assert (truths[0][:4] != truths[2][:4]).all() and (truths[0][4] == 0.005).all()
+    assert {*np.sign(truths[0][3])} == {-1.0, 1.0} and logs[0].joint_order == policy.joint_order
+
+
+def test_what_is_counted(tmp_path, monkeypatch, capsys):
+    """Fits off by 1% with intervals of 2%, for which the delay's is too narrow; a refused one; none a second time."""
+    fits = []
+
+    def identify(cfg, recording, device, progress):
+        """Answer of the trial that is next."""
+        fits.append(truth := coverage.make_log(Policy("go2/torque_multihead"), 0.1, len(fits))[1])
+        if len(fits) == 3:
+            raise UserError("nothing moves")
+        shares = np.array([0.02, 0.02, 0.02, 0.02, 0.005])[:, None]
+        return SimpleNamespace(values=1.01 * truth, half_widths=shares * np.abs(truth))
+
+    monkeypatch.setattr(coverage, "identify", identify)
+    monkeypatch.setattr(sys, "argv", ["coverage", file := str(tmp_path / "a.csv"), "--trials", "0", "2"])
+    sys.argv += ["--seconds", "0.1", "--device", "cpu"]
+    coverage.main()
+    said = capsys.readouterr().out
+    assert said.startswith("2 trials, 0 refused;") and len(fits) == 2
+    assert [line.split() for line in said.splitlines()[2:]] == [
+        *([kind, "100.0%", "1.00%", "0.50"] for kind in coverage.PARAMETERS[:4]),
+        ["delay", "0.0%", "1.00%", "2.00"],
+        ["all", "98.0%", "1.00%", "2.00"],
+    ]
+    sys.argv[4] = "3"
+    coverage.main()
+    output = capsys.readouterr()
+    assert len(fits) == 3 and "trial 2 is refused: nothing moves" in output.err
+    assert "3 trials, 1 refused;" in output.out and output.out.splitlines()[-1].split()[1] == "65.3%"
+    rows = coverage.read_rows(tmp_path / "a.csv")
+    assert len(rows) == 3 * 49 and {row["parameter"] for row in rows} == {*coverage.PARAMETERS}
+    sys.argv[1:] = [file, file]
+    coverage.main()
+    assert capsys.readouterr().out.startswith("3 trials, 1 refused;")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["rows.csv"], "there are no trials yet"),
+        (["rows.csv", "--trials", "-1", "2"], "--trials[0] must be at least 0"),
+        (["rows.csv", "b.csv", "--trials", "0", "2"], "--trials takes one file, not 2"),
+        (["other.csv"], "must have the columns trial, joint"),
+        (["none.csv"], "No such file"),
+    ],
+)
+def test_mistakes(tmp_path, words, message):
+    """Each is refused in a line."""
+    (tmp_path / "rows.csv").write_text(",".join(coverage.KEYS) + "\n")
+    (tmp_path / "other.csv").write_text("a,b\n")
+    assert_told_in_one_line(run_here("../tools/coverage.py", *words, root=tmp_path), message)
