@@ -42,14 +42,14 @@ def main() -> None:
     args = parse_args()
     cli.options_of(args)  # imports files of tasks
     with cli.slow_imports():
-        from legged_torque.identification.fit import GENERATIONS, STEPS, identify
+        from legged_torque.identification.fit import ROUNDS, identify
         from legged_torque.identification.recording import read_recording
         from legged_torque.identification.worlds import FIELDS, PARAMETERS
         from legged_torque.runtime.log import RecordedLog
         from legged_torque.utils.display import Counter
     log = RecordedLog(args.log)
     cfg, recording = task_registry.get_cfgs(log.task)[0], read_recording(log)
-    with Counter("identifying, round", GENERATIONS + STEPS) as counter:
+    with Counter("identifying, round", ROUNDS) as counter:
         found = identify(cfg, recording, resolve_device(args.device), counter.add)
     names, values = log.joint_order, dict(zip(PARAMETERS, found.values, strict=True))
     print(f"{log.task}, {len(recording.commands) * log.period:.0f} s: values, 95% intervals")

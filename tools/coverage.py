@@ -16,7 +16,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import joints_and_motors
 from legged_torque.envs import task_registry
-from legged_torque.identification.fit import GENERATIONS, STEPS, identify
+from legged_torque.identification.fit import ROUNDS, identify
 from legged_torque.identification.recording import Recording
 from legged_torque.identification.worlds import FIELDS, PARAMETERS
 from legged_torque.runtime.chirp import Chirp
@@ -146,10 +146,10 @@ def main() -> None:
             append_whole(file, ",".join(KEYS) + "\n")
         done = {int(row["trial"]) for row in read_rows(file)}
         trials = [trial for trial in range(*args.trials) if trial not in done]
-        with Counter("identifying, round", (rounds := GENERATIONS + STEPS) * len(trials)) as counter:
+        with Counter("identifying, round", ROUNDS * len(trials)) as counter:
             for count, trial in enumerate(trials, 1):
                 append_whole(file, run_trial(policy, args.seconds, trial, device, counter))
-                counter.done = rounds * count  # fits may end before
+                counter.done = ROUNDS * count  # fits may end before
     rows = [row for file in args.files for row in read_rows(file)]
     if not rows:
         raise UserError("there are no trials yet: give --trials FIRST END")

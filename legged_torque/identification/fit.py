@@ -27,6 +27,7 @@ BIAS, DELAY = 0.1, 0.02  # largest [rad, s], as of PACE; explicit steps of a sim
 GENERATIONS, SIGMA, SEED = 10, 0.25, 1  # of CMA-ES; sigma in units of what is searched
 DIFFERENCE = 0.002  # for derivatives, in units of what is searched
 STEPS, GAIN = 30, 0.1  # of Gauss-Newton: at most, and of the logarithm of the likelihood in the last one
+ROUNDS = GENERATIONS + 2 * STEPS  # at most
 LEAST_NOISE = np.array([[1e-5], [1e-3]])  # [rad, rad/s] what Unitree's encoders resolve, over sqrt(12)
 BLOCK = 0.25  # [s] after which residuals are taken as independent
 QUANTILE = 1.96  # of 95%
@@ -43,7 +44,7 @@ class Identified:
     Attributes:
         values, half_widths: :data:`PARAMETERS` by joint, and their 95% intervals either way. Shapes: (5, joints).
         noise: Root mean square of residuals, positions [rad] and velocities [rad/s]. Shape: (2, joints).
-        held_out: The same where nothing was fitted, of the robot's file and of ``values``. Shape: (2, 2, joints).
+        held_out: The same where nothing was fitted, of the robot's file and of the fit. Shape: (2, 2, joints).
     """
 
     values: np.ndarray
@@ -55,12 +56,15 @@ class Identified:
 def identify(cfg: Any, recording: Recording, device: str, progress: Callable[[], None] = lambda: None) -> Identified:
     """Return which drives of a task's robot explain a recording; a UserError names numbers that it does not tell.
 
-    ``progress`` is called after each round, of which there are GENERATIONS + STEPS at most.
+    Physics steps make the numbers of a fit wrong in proportion to their length, by more than noise does. Hence
+    there are two fits, the second with steps of half the length, whose difference says what the numbers are without.
+    ``progress`` is called after each round, of which there are ROUNDS at most.
     """
-    problem = Problem(HangingRobots(cfg, recording, device), recording)
-    numbers, noise, equations = problem.refine(problem.search(progress), progress)
-    half_widths = problem.half_widths(numbers, equations)
-    return Identified(problem.spread(numbers), problem.spread(half_widths), noise, problem.held_out(numbers))
+    coarse, fine = (Problem(HangingRobots(cfg, recording, device, step), recording) for step in (STEP, STEP / 2))
+    before, _, _ = coarse.refine(coarse.search(progress), progress)
+    numbers, noise, equations = fine.refine(before, progress)
+    half_widths, values = fine.half_widths(numbers, equations), fine.clip(2.0 * numbers - before)
+    return Identified(fine.spread(values), fine.spread(half_widths), noise, fine.held_out(numbers))
 
 
 class Problem:
@@ -87,6 +91,10 @@ class Problem:
     def spread(self, numbers: np.ndarray) -> np.ndarray:
         """Return numbers by joint. Shapes: (n,) to (5, joints)."""
         return np.vstack([numbers[:-1].reshape(4, -1), np.full(self._joints, numbers[-1])])
+
+    def clip(self, numbers: np.ndarray) -> np.ndarray:
+        """Return numbers (n,) within what is searched."""
+        return np.clip(numbers, self._low, self._high)
 
     def _residuals(self, parameters: np.ndarray, first: int, ticks: int) -> Tensor:
         """Return what encoders say less what was measured, 0 where nothing was. Shape: (ticks, worlds, 2, joints)."""
@@ -138,7 +146,7 @@ class Problem:
             damped = matrix + np.diag(damping * np.diag(matrix) + 1e-6 * self._range**-2)
             tried = numbers.copy()
             tried[free] -= np.linalg.solve(damped[np.ix_(free, free)], gradient[free])
-            tried = np.clip(tried, self._low, self._high)
+            tried = self.clip(tried)
             of_tried, equations_of_tried = self._linearized(tried)
             gain = float((self._counts * np.log(noise / of_tried)).sum())
             progress()
