@@ -27,9 +27,9 @@ LINES = {
     "legged_torque/deploy": 1575,
     "legged_torque/envs": 5332,
     "legged_torque/experiments": 1105,
-    "legged_torque/identification": 445,
+    "legged_torque/identification": 449,
     "legged_torque/importer": 1252,
-    "legged_torque/learning": 4325,
+    "legged_torque/learning": 4290,
     "legged_torque/motors": 1525,
     "legged_torque/runtime": 2197,
     "legged_torque/sensors": 305,
@@ -40,10 +40,10 @@ LINES = {
     "scripts": 2114,
     "paper": 3240,
     "tools": 1665,
-    "tests": 26520,
+    "tests": 26526,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 32_914  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 32_883  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -27,7 +27,8 @@ BIAS, DELAY = 0.1, 0.02  # largest [rad, s], as of PACE; explicit steps of a sim
 GENERATIONS, SIGMA, SEED = 10, 0.25, 1  # of CMA-ES; sigma in units of what is searched
 DIFFERENCE = 0.002  # for derivatives, in units of what is searched
 STEPS, GAIN = 30, 0.1  # of Gauss-Newton: at most, and of the logarithm of the likelihood in the last one
-ROUNDS = GENERATIONS + 2 * STEPS  # at most
+FINER = (1, 2, 4)  # how many times as many physics steps each fit takes
+ROUNDS = GENERATIONS + len(FINER) * STEPS  # at most
 LEAST_NOISE = np.array([[1e-5], [1e-3]])  # [rad, rad/s] what Unitree's encoders resolve, over sqrt(12)
 BLOCK = 0.25  # [s] after which residuals are taken as independent
 QUANTILE = 1.96  # of 95%
@@ -44,7 +45,7 @@ class Identified:
     Attributes:
         values, half_widths: :data:`PARAMETERS` by joint, and their 95% intervals either way. Shapes: (5, joints).
         noise: Root mean square of residuals, positions [rad] and velocities [rad/s]. Shape: (2, joints).
-        held_out: The same where nothing was fitted, of the robot's file and of the fit. Shape: (2, 2, joints).
+        held_out: The same where nothing was fitted, of the robot's file and of the last fit. Shape: (2, 2, joints).
     """
 
     values: np.ndarray
@@ -56,15 +57,18 @@ class Identified:
 def identify(cfg: Any, recording: Recording, device: str, progress: Callable[[], None] = lambda: None) -> Identified:
     """Return which drives of a task's robot explain a recording; a UserError names numbers that it does not tell.
 
-    Physics steps make the numbers of a fit wrong in proportion to their length, by more than noise does. Hence
-    there are two fits, the second with steps of half the length, whose difference says what the numbers are without.
+    Physics steps make the numbers of a fit wrong, by more than noise does, and in proportion to their length and its
+    square. Hence there are three fits, each with shorter steps, and a parabola through them says what is right.
     ``progress`` is called after each round, of which there are ROUNDS at most.
     """
-    coarse, fine = (Problem(HangingRobots(cfg, recording, device, step), recording) for step in (STEP, STEP / 2))
-    before, _, _ = coarse.refine(coarse.search(progress), progress)
-    numbers, noise, equations = fine.refine(before, progress)
-    half_widths, values = fine.half_widths(numbers, equations), fine.clip(2.0 * numbers - before)
-    return Identified(fine.spread(values), fine.spread(half_widths), noise, fine.held_out(numbers))
+    problems, fits = [Problem(HangingRobots(cfg, recording, device, times), recording) for times in FINER], []
+    numbers = problems[0].search(progress)
+    for problem in problems:
+        numbers, noise, equations = problem.refine(numbers, progress)
+        fits.append(numbers)
+    half_widths = problem.half_widths(numbers, equations)
+    values = problem.clip(np.linalg.solve(np.vander(1.0 / np.array(FINER)), np.array(fits))[-1])
+    return Identified(problem.spread(values), problem.spread(half_widths), noise, problem.held_out(numbers))
 
 
 class Problem:

@@ -17,7 +17,7 @@ from legged_torque.sim.registry import make_engine
 from legged_torque.utils.errors import refuse, unknown_name
 from legged_torque.utils.mjcf import hang_up
 
-STEP = 1e-3  # [s] longest physics step, unless told otherwise
+STEP = 1e-3  # [s] longest physics step
 TICKS = 20  # of the log that are simulated as one CUDA graph
 FIELDS = {"armature": "dof_armature", "viscous_friction": "dof_damping", "coulomb_friction": "dof_frictionloss"}
 PARAMETERS = (*FIELDS, "bias", "delay")
@@ -39,13 +39,13 @@ class HangingRobots:
         torque_limits: Lowest and highest [N m]. Shape: (2, joints).
     """
 
-    def __init__(self, cfg: Any, recording: Recording, device: str, longest_step: float = STEP) -> None:
-        """Hang the robot of a task's settings up as that of a log, with physics steps of at most so many seconds.
+    def __init__(self, cfg: Any, recording: Recording, device: str, finer: int = 1) -> None:
+        """Hang the robot of a task's settings up as that of a log; ``finer``: 2 for steps of half the length, say.
 
         A UserError if it lacks joints of the log, or the log lacks joints that hang on a branch with others of it.
         """
         self._recording, wanted = recording, recording.joint_order
-        self._substeps = int(np.ceil(recording.period / longest_step - 1e-9))
+        self._substeps = finer * int(np.ceil(recording.period / STEP - 1e-9))
         self._step = recording.period / self._substeps
         asset = load_asset(cfg)
         model, names = asset.mj_model, asset.dof_names

@@ -111,7 +111,7 @@ def roll_out(runner):
     with torch.no_grad():
         for parameter in runner.alg.actor.mlp.parameters():
             parameter += 0.02 * torch.randn(parameter.shape)
-    runner.alg.choose(torch.arange(len(runner.alg.indices)))
+    runner.alg.indices.copy_(torch.arange(len(runner.alg.indices)))
     return runner.alg._gather()
 
 
@@ -150,7 +150,7 @@ def test_losses_on_a_cpu(make_runner, name, augmentation):
     """They and their gradients are those of torch's operations, for half of the samples in any order."""
     runner = make_runner(name, augmentation=augmentation, **{"algorithm.num_mini_batches": 2})
     roll_out(runner)
-    runner.alg.choose(torch.randperm(SAMPLES)[: SAMPLES // 2])
+    runner.alg.indices.copy_(torch.randperm(SAMPLES)[: SAMPLES // 2])
     found = []
     for kind in (CpuPPO, TorchPPO):
         runner.alg.optimizer.zero_grad()

@@ -93,12 +93,12 @@ def test_a_bad_sample_changes_nothing(device):
     for alg in (spoiled, healthy):
         record_rollout(alg)
     spoiled.storage.returns[0, 2] = torch.nan
-    spoiled.choose(torch.arange(spoiled.batch_size))
+    spoiled.indices.copy_(torch.arange(spoiled.batch_size))
     before = [tensor.clone() for tensor in spoiled.tensors()]
     spoiled.update_graph()
     assert all(map(torch.equal, spoiled.tensors(), before)) and float(spoiled.losses[-1]) == 1.0
     for alg in (spoiled, healthy):
-        alg.choose(torch.arange(60, 60 + alg.batch_size))
+        alg.indices.copy_(torch.arange(60, 60 + alg.batch_size))
         alg.update_graph()
     assert all(map(torch.equal, spoiled.tensors(), healthy.tensors()))
 

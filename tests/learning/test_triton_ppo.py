@@ -113,7 +113,7 @@ def test_updates_are_those_of_torch():
 def learn(alg, firsts):
     """Learn from minibatches that begin at these samples of a rollout."""
     for first in firsts:
-        alg.choose(torch.arange(first, first + alg.batch_size))
+        alg.indices.copy_(torch.arange(first, first + alg.batch_size))
         alg.update_minibatch()
 
 

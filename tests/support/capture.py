@@ -44,13 +44,12 @@ def gradient_errors(alg):
     """
     state, rate, losses = alg.tensors(), alg.learning_rate, alg.losses
     tensors = [*state, rate, losses]
-    before, chosen = [tensor.clone() for tensor in tensors], alg.indices.clone()
+    before = [tensor.clone() for tensor in tensors]
     alg.update_minibatch()
     found = [gradient.clone() for gradient in alg.gradients()]
     for tensor, value in zip(tensors, before, strict=True):
         tensor.copy_(value)
     alg.round_weights()
-    alg.choose(chosen)
     alg.optimizer.zero_grad()
     with torch.enable_grad():
         alg.loss()[0].backward()

@@ -1,6 +1,5 @@
 """rsl_rl's PPO with an update that runs on the device from end to end."""
 
-from collections.abc import Iterator
 from itertools import zip_longest
 from typing import Any
 
@@ -174,17 +173,18 @@ class TorchPPO(PPO):
         self.allocate()  # of a training that keeps no run
         self.losses.zero_()
         before = [tensor.clone() for tensor in self.tensors()]
-        size = self.batch_size * self.num_mini_batches
-        orders = (torch.randperm(size, device=self.device) for _ in range(self.num_learning_epochs))
-        self.learn_from(indices for order in orders for indices in order.split(self.batch_size))
+        for _ in range(self.num_learning_epochs):
+            order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
+            for indices in order.split(self.batch_size):
+                self.indices.copy_(indices)
+                self.update_graph()
         self._update_normalization()
         self.storage.clear()
         is_finite = torch.cat([tensor.flatten() for tensor in self.tensors()]).isfinite().all()
-        others = torch.stack([is_finite.float(), self.learning_rate, self.action_std().mean()])
-        numbers = torch.cat([self.losses, others])
+        numbers = torch.cat([self.losses, is_finite.float().unsqueeze(0)])
         if self.is_multi_gpu:
             distributed.average([numbers])
-        *values, share_finite, rate, std = numbers.tolist()  # the only time that the host waits
+        *values, share_finite = numbers.tolist()  # the only time that the host waits
         losses = dict(zip(LOSS_NAMES, values, strict=True))
         num_updates = self.num_learning_epochs * self.num_mini_batches
         if share_finite < 1.0:  # in any process
@@ -193,7 +193,8 @@ class TorchPPO(PPO):
             losses = dict.fromkeys(LOSS_NAMES, 0.0) | {"skipped_updates": float(num_updates)}
         updates = num_updates - losses["skipped_updates"]
         means = {name: loss if name == "skipped_updates" else loss / max(updates, 1) for name, loss in losses.items()}
-        return {**means, "learning_rate": rate, "action_std": std, "all_skipped": updates <= 0}
+        policy = {"learning_rate": self.learning_rate.item(), "action_std": self.action_std().mean().item()}
+        return {**means, **policy, "all_skipped": updates <= 0}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as rsl_rl does, and keep the learning rate the tensor that it was."""
@@ -253,16 +254,6 @@ class TorchPPO(PPO):
             actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
         loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
         return loss, torch.stack([value_loss, surrogate_loss, entropy, kl]).detach()
-
-    def choose(self, indices: Tensor) -> None:
-        """Let the next gradient step learn from these samples of the rollout. Shape: (batch_size,), int64."""
-        self.indices.copy_(indices)
-
-    def learn_from(self, minibatches: Iterator[Tensor]) -> None:
-        """Take a gradient step on each minibatch; arguments of :meth:`choose`."""
-        for indices in minibatches:
-            self.choose(indices)
-            self.update_graph()
 
     def update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``indices``."""

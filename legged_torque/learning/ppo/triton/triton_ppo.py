@@ -2,9 +2,8 @@
 
 import contextlib
 import functools
-import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -74,8 +73,6 @@ class TritonPPO(TorchPPO):
         storage.distribution_params = (self._means, self._stds.expand_as(self._means))  # the same for all samples
         self._maps = [[self._mirror_map(group) for group in model.obs_groups] for model in self._models]
         self._action_map = self._mirror_map("actions")
-        self._following = torch.zeros_like(self.indices)  # the samples of the gradient step after the next one
-        self._side = torch.cuda.Stream(self.device) if flat.is_cuda else None
         self._share_optimizer_state()
 
     # ---- acting --------------------------------------------------------------------------------------------------
@@ -128,38 +125,23 @@ class TritonPPO(TorchPPO):
 
     # ---- learning ------------------------------------------------------------------------------------------------
 
-    def choose(self, indices: Tensor) -> None:
-        """Do what :class:`TorchPPO` does, and write what the networks read."""
-        super().choose(indices)
+    @shows_compilation
+    def update_minibatch(self) -> None:
+        """Take one gradient step on the samples of ``indices``."""
         memory = self._memory
         for inputs, model, maps in zip(memory.inputs, self._models, self._maps, strict=True):
             groups = [self.storage.observations[group].flatten(0, 1) for group in model.obs_groups]
             self._observe(inputs, groups, memory.rows, maps)
-
-    @shows_compilation
-    def learn_from(self, minibatches: Iterator[Tensor]) -> None:
-        """Do what :class:`TorchPPO` does; each step writes what the networks read in the next one."""
-        first = next(minibatches)
-        self.choose(first)
-        for following in itertools.chain(minibatches, [first]):  # nothing follows the last one
-            self._following.copy_(following)
-            self.update_graph()
-
-    def update_minibatch(self) -> None:
-        """Take one gradient step on the samples that were chosen, and choose those that follow."""
-        self._forward(self._memory.rows)
+        self._forward(memory.rows)
         self._write_losses()
-        self._backward()
-        if self._side:  # what is left to do takes few programs
-            self._side.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(self._side):
-            self.choose(self._following)
-        self._sum_gradients()
+        for table in memory.backward:
+            arguments = (memory.values, memory.gradients, memory.weights, memory.sums, memory.sums.shape[1], table)
+            settings = {"SAMPLES": SAMPLES, "TILE": NARROW_TILE} | products.BACKWARD
+            self._product(products.input_gradient, arguments, memory.rows // SAMPLES, settings)
+        self._weight_gradients()
         if self.is_multi_gpu:
             distributed.average([self._gradient])
         self._step()
-        if self._side:
-            torch.cuda.current_stream().wait_stream(self._side)
 
     def round_weights(self) -> None:
         """Prepare the weights for the products, after something else than a gradient step has changed them."""
@@ -244,27 +226,19 @@ class TritonPPO(TorchPPO):
             COLUMNS=triton.next_power_of_2(size), num_warps=1,
         )  # fmt: skip
 
-    def _backward(self) -> None:
-        """Compute the gradients of what layers read, and those of weights from each part of the samples."""
+    def _weight_gradients(self) -> None:
+        """Compute the gradient of all parameters from those of what the layers compute."""
         memory = self._memory
-        for table in memory.backward:
-            read = (memory.values, memory.gradients, memory.weights, memory.sums, memory.sums.shape[1], table)
-            settings = {"SAMPLES": SAMPLES, "TILE": NARROW_TILE} | products.BACKWARD
-            self._product(products.input_gradient, read, memory.rows // SAMPLES, settings)
         parts, room = memory.partial.shape
         arguments = (memory.values, memory.gradients, memory.partial, memory.rows // parts, room, memory.weight_tiles)
         self._product(products.weight_gradient, arguments, parts, {"TILE": TILE} | products.BACKWARD)
-
-    def _sum_gradients(self) -> None:
-        """Sum up the gradients of all parameters over the parts of the samples."""
-        memory = self._memory
+        size = len(memory.flat)
         for sums, to in ((memory.loss_sums, memory.loss_destination), (memory.sums, memory.destination)):
             steps.sum_rows[(triton.cdiv(sums.shape[1], steps.COLUMNS),)](
                 sums, *sums.shape, to, self._gradient, ROWS=steps.ROWS, COLUMNS=steps.COLUMNS, num_warps=8
             )
-        size = len(memory.flat)
         steps.sum_parts[(triton.cdiv(size, steps.BLOCK),)](
-            memory.partial, *memory.partial.shape, memory.source, self._gradient, size, BLOCK=steps.BLOCK
+            memory.partial, parts, room, memory.source, self._gradient, size, BLOCK=steps.BLOCK
         )
 
     def _step(self) -> None:
