@@ -58,7 +58,7 @@ def main() -> None:
         pairs = zip(found.values[:4, joint], found.half_widths[:4, joint], strict=True)
         print(f"{name:<20}", *(f"{f'{value:.4g} +- {half:.1g}':<30}" for value, half in pairs))
     print(f"delay {1e3 * found.values[4, 0]:.2f} +- {1e3 * found.half_widths[4, 0]:.1g} ms")
-    print("error where nothing was fitted [rad], with the numbers of the robot's file and with these")
+    print("error where nothing was fitted [rad], of the robot's file and of the last fit")
     for name, *errors in zip(names, *found.held_out[:, 0], strict=True):
         print(f"{name:<20}", *(f"{error:<10.2g}" for error in errors))
     write_whole(args.out, settings_text(names, values, cfg.sim.dt, FIELDS))

@@ -25,15 +25,17 @@ from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.display import Counter, warn
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import append_whole
-from legged_torque.utils.limits import Number, Positive
+from legged_torque.utils.limits import Number
 from legged_torque.utils.mjcf import set_joints, torque_range
 from legged_torque.utils.runs import commit
 
+POLICY, SECONDS = "go2/torque_multihead", 40.0  # whose robot, pose and gains it is; of a log
 RATE, STEP = 500.0, 2e-4  # ticks per second; [s] of the truth's physics: half of it moves no velocity by 1e-4 rad/s
 DRAWN = np.array([[0.008, 0.03], [0.05, 0.4], [0.15, 0.9], [0.02, 0.06]])  # as PARAMETERS; biases have either sign
 DELAY, SETTLE = 0.005, 0.5  # [s]; the latter before a log begins
 NOISE = np.array([[5e-4], [0.05]])  # of encoders [rad, rad/s]
 KEYS = ("trial", "joint", "parameter", "truth", "estimate", "low", "high", "covered", "seconds", "commit")
+COMMIT = commit().removeprefix("+g")
 
 
 def simulate(file: Path, names: list[str], commands: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -68,13 +70,13 @@ def simulate(file: Path, names: list[str], commands: np.ndarray, truth: np.ndarr
     return np.array(measured)
 
 
-def make_log(policy: Policy, seconds: float, trial: int) -> tuple[Recording, np.ndarray]:
+def make_log(policy: Policy, trial: int) -> tuple[Recording, np.ndarray]:
     """Return the log of a random robot with a policy's gains, and its numbers by joint (5, joints)."""
-    names, chirp, rng = policy.joint_order, Chirp(policy, RATE, seconds), np.random.default_rng(trial)
+    names, chirp, rng = policy.joint_order, Chirp(policy, RATE, SECONDS), np.random.default_rng(trial)
     low, high = DRAWN.T[..., None]
     truth = np.vstack([rng.uniform(low, high, (4, len(names))), np.full(len(names), DELAY)])
     truth[3] *= rng.choice([-1.0, 1.0], len(names))
-    commands = np.zeros((round(RATE * seconds), 5, len(names)))
+    commands = np.zeros((round(RATE * SECONDS), 5, len(names)))
     for command in commands:
         tau, target, kp, kd = chirp.drive_targets(chirp.act(np.zeros(0)))
         command[:] = tau, target, np.zeros_like(target), kp, kd
@@ -83,9 +85,9 @@ def make_log(policy: Policy, seconds: float, trial: int) -> tuple[Recording, np.
     return Recording(names, 1.0 / RATE, np.array([1.0, 0.0, 0.0, 0.0]), commands, measured), truth
 
 
-def run_trial(policy: Policy, seconds: float, trial: int, device: str, counter: Counter) -> str:
+def run_trial(policy: Policy, trial: int, device: str, counter: Counter) -> str:
     """Return the rows of a trial as CSV; numbers of a log that is refused are NaN, and not covered."""
-    (recording, truth), start = make_log(policy, seconds, trial), time.perf_counter()
+    (recording, truth), start = make_log(policy, trial), time.perf_counter()
     values = halves = np.full_like(truth, np.nan)
     try:
         found = identify(task_registry.get_cfgs(policy.description["task"])[0], recording, device, counter.add)
@@ -98,17 +100,23 @@ def run_trial(policy: Policy, seconds: float, trial: int, device: str, counter: 
             true, value, half = (each[number, joint] for each in (truth, values, halves))
             numbers = ",".join(f"{each:.8g}" for each in (true, value, value - half, value + half))
             numbers += f",{int(abs(value - true) <= half)}"
-            lines.append(f"{trial},{name},{kind},{numbers},{took:.1f},{commit().removeprefix('+g')}\n")
+            lines.append(f"{trial},{name},{kind},{numbers},{took:.1f},{COMMIT}\n")
     return "".join(lines)
 
 
-def read_rows(file: Path) -> list[dict[str, str]]:
-    """Return the rows of a file; a UserError if it is not of this program."""
-    with file.open(encoding="utf-8", newline="") as stream:
-        reader = csv.DictReader(stream)
-        if tuple(reader.fieldnames or ()) != KEYS:
-            raise UserError(f"'{file}' must have the columns {', '.join(KEYS)}")
-        return list(reader)
+def read_rows(files: list[Path]) -> list[dict[str, str]]:
+    """Return the rows of files; a UserError if one is not of this program, or two have the same trial."""
+    rows: list[dict[str, str]] = []
+    for file in files:
+        with file.open(encoding="utf-8", newline="") as stream:
+            reader = csv.DictReader(stream)
+            if tuple(reader.fieldnames or ()) != KEYS:
+                raise UserError(f"'{file}' must have the columns {', '.join(KEYS)}")
+            new = list(reader)
+        if twice := {row["trial"] for row in rows} & {row["trial"] for row in new}:
+            raise UserError(f"'{file}' has trial {min(twice, key=int)}, as another file does")
+        rows += new
+    return rows
 
 
 def summary(rows: list[dict[str, str]]) -> str:
@@ -133,25 +141,25 @@ def main() -> None:
     parser = cli.Parser(__doc__)
     parser.add_argument("files", type=Path, nargs="+", help="CSV files; trials are added to a single one")
     parser.add_argument("--trials", type=int, nargs=2, metavar=("FIRST", "END"), help="seeds, END not included")
-    parser.add_argument("--policy", default="go2/torque_multihead", help="robot, pose and gains; default: %(default)s")
-    parser.add_argument("--seconds", type=float, default=40.0, help="of a log; default: %(default)g")
     cli.add_options(parser, "device")
     args = parser.parse_args()
-    cli.check_args(args, trials=list[Number], seconds=Positive)
+    cli.check_args(args, trials=list[Number])
     if args.trials:
         if len(args.files) > 1:
             raise UserError(f"--trials takes one file, not {len(args.files)}")
-        file, policy, device = args.files[0], Policy(args.policy), resolve_device(args.device)
+        file, policy, device = args.files[0], Policy(POLICY), resolve_device(args.device)
         if not file.exists():
             append_whole(file, ",".join(KEYS) + "\n")
-        done = {int(row["trial"]) for row in read_rows(file)}
+        rows = read_rows([file])
+        if others := {row["commit"] for row in rows} - {COMMIT}:
+            raise UserError(f"'{file}' has trials of commit {min(others)}, not {COMMIT}: give another file")
+        done = {int(row["trial"]) for row in rows}
         trials = [trial for trial in range(*args.trials) if trial not in done]
         with Counter("identifying, round", ROUNDS * len(trials)) as counter:
             for count, trial in enumerate(trials, 1):
-                append_whole(file, run_trial(policy, args.seconds, trial, device, counter))
+                append_whole(file, run_trial(policy, trial, device, counter))
                 counter.done = ROUNDS * count  # fits may end before
-    rows = [row for file in args.files for row in read_rows(file)]
-    if not rows:
+    if not (rows := read_rows(args.files)):
         raise UserError("there are no trials yet: give --trials FIRST END")
     print(summary(rows))
 

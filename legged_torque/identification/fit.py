@@ -57,18 +57,18 @@ class Identified:
 def identify(cfg: Any, recording: Recording, device: str, progress: Callable[[], None] = lambda: None) -> Identified:
     """Return which drives of a task's robot explain a recording; a UserError names numbers that it does not tell.
 
-    Physics steps make the numbers of a fit wrong, by more than noise does, and in proportion to their length and its
-    square. Hence there are three fits, each with shorter steps, and a parabola through them says what is right.
-    ``progress`` is called after each round, of which there are ROUNDS at most.
+    Physics steps of length h bias a fit by a h + b h^2, which is more than noise does. Hence there are three fits with
+    ever shorter steps, and a parabola through them gives the numbers at h = 0. ``progress`` is called after each
+    round, of which there are ROUNDS at most.
     """
     problems, fits = [Problem(HangingRobots(cfg, recording, device, times), recording) for times in FINER], []
     numbers = problems[0].search(progress)
     for problem in problems:
         numbers, noise, equations = problem.refine(numbers, progress)
         fits.append(numbers)
-    half_widths = problem.half_widths(numbers, equations)
-    values = problem.clip(np.linalg.solve(np.vander(1.0 / np.array(FINER)), np.array(fits))[-1])
-    return Identified(problem.spread(values), problem.spread(half_widths), noise, problem.held_out(numbers))
+    values, last = np.linalg.solve(np.vander(1.0 / np.array(FINER)), np.array(fits))[-1], problems[-1]
+    half_widths = last.spread(last.half_widths(values, equations))
+    return Identified(last.spread(last.clip(values)), half_widths, noise, last.held_out(numbers))
 
 
 class Problem:

@@ -270,23 +270,44 @@ def test_students():
     assert "{:.1f} and {:.1f}% fewer cross the worst kind (first A1, two students)".format(*first) in text
     assert "{:.1f}, {:.1f} and {:.1f}% (second), {:.1f} and {:.1f}% (Go2".format(*second, *go2) in text
     equal, longer = (less(crossed, f"student, {how}", trained).max(axis=1) for how in ("120 million", "48 steps"))
-    assert f"equal weights ({equal['a1', 2, 1000]:.1f}% of the second A1's)" in text
-    assert f"gradients through 48 steps ({longer['a1', 2, 1000]:.1f}%)" in text
+    said = f"Equal weights ({equal['a1', 2, 1000]:.1f}% of the second A1's; {longer['a1', 2, 1000]:.1f}% with gradients"
+    assert f"{said} through 48 steps)" in text
     for how, first in (("a tenth", 1), ("nothing", 1), ("harder rows, seed 2", 2), ("harder rows, seed 3", 3)):
         other, own = (less(crossed, f"student, {each}", trained).max(axis=1) for each in (how, f"seed {first}"))
         assert len(other) and (other > 0.9 * own.reindex(other.index)).all(), how  # within their errors
     changed = ("240 million", "512 remembered", "8 epochs", "annealed from the start", "std 0.3", "24 steps")
     changed = [f"student, seed 2, {how}" for how in (*changed, "5 steps of history")]
     lost = [less(crossed, policy, trained).max(axis=1)["a1", 2, 1000] for policy in changed]
-    assert f"other settings lost {min(lost):.1f} to {max(lost):.1f}% (9b2b5d2" in text
+    assert len(lost) == 7 and f"in place of the 3.7% ({min(lost):.1f} to {max(lost):.1f}%; 9b2b5d2" in text
     lstm = pd.concat([less(crossed, f"student, seed {seed}, lstm", trained).max(axis=1) for seed in (1, 2, 3, 4)])
-    lost = [lstm[key].tolist() for key in (("a1", 1), ("a1", 2), ("go2", 1))]
-    said = "LSTMs lost {:.1f} and {:.1f}%, {:.1f}, {:.1f}, {:.1f} and {:.1f}%, {:.1f} and {:.1f}% (2986f11)"
-    assert said.format(*lost[0], *lost[1], *lost[2]) in text
+    first, second, go2 = (lstm[key] for key in (("a1", 1), ("a1", 2), ("go2", 1)))
+    said = (
+        "of LSTMs {:.1f} and {:.1f}% (first A1), {:.1f} to {:.1f}% (second, four students) and {:.1f} and {:.1f}% (Go2"
+    )
+    assert said.format(*first, second.min(), second.max(), *go2) in text and len(second) == 4
     twice = less(crossed, "student, 240 million", trained).max(axis=1)
     assert len(twice) == 2 and (twice > equal.reindex(twice.index)).all()
     stones = pd.concat([less(tracked, policy, ["stepping_stones"])["stepping_stones"] for policy in seeds])
     assert f"students track {stones.min():.0f} to {stones.max():.0f}% less" in text
+
+
+def test_coverage():
+    """Errors of identified numbers, and how many of their intervals held."""
+    data, text = pd.read_csv(DOCS / "results" / "coverage.csv.xz"), text_of("howto/identify.md", "Physics steps bias")
+    text = text.replace("\n", " ")
+    data["held"], errors = data["error"].abs() <= data["half_width"], data["error"].abs()
+    data["share"] = errors / data["truth"].abs()
+    two, three = data[data["commit"] == "2986f11"], data[data["commit"] == "e463d2a"]
+    assert two["trial"].nunique() == 50 and f"{100.0 * two['held'].mean():.1f}% of the intervals held" in text
+    held = 100.0 * two.groupby("parameter")["held"].mean()
+    assert f"(viscous friction {held['viscous_friction']:.0f}%, delay {held['delay']:.0f}%)" in text
+    share, error = (two.assign(of=values).groupby("parameter")["of"].max() for values in (data["share"], errors))
+    largest = 100.0 * share[["armature", "viscous_friction", "coulomb_friction"]].max()
+    assert f"by at most {largest:.1f}%, biases by {1e3 * error['bias']:.1f} mrad" in text
+    assert f"mrad, delays by {1e3 * error['delay']:.4f} ms" in text
+    before = two[two["trial"].isin(three["trial"])]["held"].mean()
+    assert f"raised {100.0 * before:.0f}% to {100.0 * three['held'].mean():.0f}% in two of the logs" in text
+    assert "in {:.0f} and {:.0f} s, on two cores".format(*sorted(three["seconds"].unique())) in text
 
 
 def test_identified():

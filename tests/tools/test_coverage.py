@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.one_leg import NOISE, POSE, TRUTH, one_leg, record, sweep
 from support.scripts import assert_told_in_one_line, run_here
+from support.settings import error_of
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.utils.errors import UserError
@@ -24,10 +25,11 @@ def test_simulation(tmp_path):
 
 def test_noise_and_numbers(monkeypatch):
     """Trials differ, and repeat themselves; encoders have the noise of the documentation, and biases either sign."""
-    policy = Policy("go2/torque_multihead")
-    logs, truths = zip(*(coverage.make_log(policy, 0.5, trial) for trial in (0, 0, 1)), strict=True)
+    policy = Policy(coverage.POLICY)
+    monkeypatch.setattr(coverage, "SECONDS", 0.5)
+    logs, truths = zip(*(coverage.make_log(policy, trial) for trial in (0, 0, 1)), strict=True)
     monkeypatch.setattr(coverage, "NOISE", 0.0)
-    noise = logs[0].measured - coverage.make_log(policy, 0.5, 0)[0].measured
+    noise = logs[0].measured - coverage.make_log(policy, 0)[0].measured
     np.testing.assert_allclose(noise.std(axis=(0, 2)), NOISE[:, 0], rtol=0.05)
     np.testing.assert_array_equal(logs[0].measured, logs[1].measured)
     assert (truths[0][:4] != truths[2][:4]).all() and (truths[0][4] == 0.005).all()
@@ -40,15 +42,16 @@ def test_what_is_counted(tmp_path, monkeypatch, capsys):
 
     def identify(cfg, recording, device, progress):
         """Answer of the trial that is next."""
-        fits.append(truth := coverage.make_log(Policy("go2/torque_multihead"), 0.1, len(fits))[1])
+        fits.append(truth := coverage.make_log(Policy(coverage.POLICY), len(fits))[1])
         if len(fits) == 3:
             raise UserError("nothing moves")
         shares = np.array([0.02, 0.02, 0.02, 0.02, 0.005])[:, None]
         return SimpleNamespace(values=1.01 * truth, half_widths=shares * np.abs(truth))
 
     monkeypatch.setattr(coverage, "identify", identify)
+    monkeypatch.setattr(coverage, "SECONDS", 0.1)
     monkeypatch.setattr(sys, "argv", ["coverage", file := str(tmp_path / "a.csv"), "--trials", "0", "2"])
-    sys.argv += ["--seconds", "0.1", "--device", "cpu"]
+    sys.argv += ["--device", "cpu"]
     coverage.main()
     said = capsys.readouterr().out
     assert said.startswith("2 trials, 0 refused;") and len(fits) == 2
@@ -62,11 +65,12 @@ def test_what_is_counted(tmp_path, monkeypatch, capsys):
     output = capsys.readouterr()
     assert len(fits) == 3 and "trial 2 is refused: nothing moves" in output.err
     assert "3 trials, 1 refused;" in output.out and output.out.splitlines()[-1].split()[1] == "65.3%"
-    rows = coverage.read_rows(tmp_path / "a.csv")
+    rows = coverage.read_rows([tmp_path / "a.csv"])
     assert len(rows) == 3 * 49 and {row["parameter"] for row in rows} == {*coverage.PARAMETERS}
+    monkeypatch.setattr(coverage, "COMMIT", "another")
+    assert "has trials of commit" in error_of(coverage.main) and len(fits) == 3
     sys.argv[1:] = [file, file]
-    coverage.main()
-    assert capsys.readouterr().out.startswith("3 trials, 1 refused;")
+    assert error_of(coverage.main).endswith("has trial 0, as another file does")
 
 
 @pytest.mark.parametrize(
