@@ -66,11 +66,12 @@ def fault(state: RobotState, age: float, received: Received, joints: Joints, bra
         (beyond, "rad, beyond its range", state.joint_positions),
         (speeds, "rad/s, too fast", state.joint_velocities),
         (hot, "deg C, too hot", state.temperatures),
-        (state.errors, "as error flag", state.errors),
+        (state.errors, "as error flag", state.errors.astype(int)),
     ):
         worst = int(np.argmax(excess))
         if excess[worst] > 0:
-            return f"{joints.names[worst]} has {values[worst]:.4g} {what}"
+            value = values[worst]
+            return f"{joints.names[worst]} has {value:{'#x' if values.dtype.kind == 'i' else '.4g'}} {what}"
     return ""
 
 

@@ -184,7 +184,8 @@ class Controller:
     def _fault(self) -> str:
         """Return why the robot must not move."""
         if self.state is None:
-            return next(iter(self._problems), "the robot has not said anything yet")
+            silent = "all messages are damaged" if self._damaged else "the robot has not said anything yet"
+            return next(iter(self._problems), silent)
         if problem := self._lateness(self._now, self._missed):
             return problem
         seen = Received(None, self._damaged, problems=self._problems)

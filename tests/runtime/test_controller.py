@@ -289,6 +289,15 @@ def test_why_it_was_stopped(policy):
     assert world.controller.reason == "the program ends" and len(world.stops) == 1
 
 
+def test_before_the_first_state(policy):
+    """A robot that is silent is told from one whose messages are all damaged."""
+    for faults, expected in ((Faults(silent=True), "not said anything"), (Faults(damaged=1.0), "messages are damaged")):
+        world = World(policy)
+        world.robot.faults = faults
+        world.run(5)
+        assert expected in world.controller.request(Mode.STAND) and world.controller.mode != Mode.STAND
+
+
 def test_a_policy_takes_over_bit_by_bit(policy, monkeypatch):
     """From standing, torques become those of a policy that always says the same, evenly within half a second."""
     world, off, speed = standing_at_once(policy), np.linspace(-0.05, 0.05, 12), np.linspace(0.2, -0.2, 12)

@@ -70,7 +70,7 @@ def test_an_a1_stands_up(policy, sdk):
         if tick == 1705:
             assert controller.mode == Mode.STAND and simulated.data.qpos[2] > 0.25 and simulated.excess <= 1e-6
             simulated.faults.error = [JOINT_ORDER[4]]
-    assert controller.mode == Mode.DAMPING and f"{JOINT_ORDER[4]} has 1 as error flag" in controller.reason
+    assert controller.mode == Mode.DAMPING and f"{JOINT_ORDER[4]} has 0x1 as error flag" in controller.reason
     assert robot._command.power == 3 and robot._safety.kind == "A1"
     sent = robot._udp.sent
     assert set(sent.q) == {2.146e9} and not sent.kp.any() and not sent.dq.any() and sent.kd.all()
