@@ -66,12 +66,12 @@ def fault(state: RobotState, age: float, received: Received, joints: Joints, bra
         (beyond, "rad, beyond its range", state.joint_positions),
         (speeds, "rad/s, too fast", state.joint_velocities),
         (hot, "deg C, too hot", state.temperatures),
-        (state.errors, "as error flag", state.errors.astype(int)),
+        (state.errors, "as error flag", state.errors),
     ):
         worst = int(np.argmax(excess))
         if excess[worst] > 0:
-            value = values[worst]
-            return f"{joints.names[worst]} has {value:{'#x' if values.dtype.kind == 'i' else '.4g'}} {what}"
+            number = f"{int(values[worst]):#x}" if values is state.errors else f"{values[worst]:.4g}"
+            return f"{joints.names[worst]} has {number} {what}"
     return ""
 
 
