@@ -306,8 +306,10 @@ def test_coverage():
     assert f"by at most {largest:.1f}%, biases by {1e3 * error['bias']:.1f} mrad" in text
     assert f"mrad, delays by {1e3 * error['delay']:.4f} ms" in text
     before = two[two["trial"].isin(three["trial"])]["held"].mean()
-    assert f"raised {100.0 * before:.0f}% to {100.0 * three['held'].mean():.0f}% in two of the logs" in text
-    assert "in {:.0f} and {:.0f} s, on two cores".format(*sorted(three["seconds"].unique())) in text
+    assert f"raised {100.0 * before:.1f}% to {100.0 * three['held'].mean():.1f}% in six of the logs" in text
+    late = three[three["parameter"] == "delay"]
+    assert f"delay {100.0 * late['held'].mean():.0f}%), in {late['seconds'].min():.0f} to" in text and len(late) == 6
+    assert f"to {late['seconds'].max():.0f} s, on two cores" in text
 
 
 def test_identified():
