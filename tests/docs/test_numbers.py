@@ -309,7 +309,7 @@ def test_coverage():
     assert f"raised {100.0 * before:.1f}% to {100.0 * three['held'].mean():.1f}% in six of the logs" in text
     late = three[three["parameter"] == "delay"]
     assert f"delay {100.0 * late['held'].mean():.0f}%), in {late['seconds'].min():.0f} to" in text and len(late) == 6
-    assert f"to {late['seconds'].max():.0f} s, on two cores" in text
+    assert f"to {late['seconds'].max():.0f} s, on a core each" in text
 
 
 def test_identified():

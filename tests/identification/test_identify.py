@@ -79,7 +79,7 @@ def test_known_numbers(found):
     np.testing.assert_allclose(result["values"][:4], TRUTH[:4], rtol=0.005)
     np.testing.assert_allclose(result["values"][4], 0.005, atol=3e-6)
     errors = np.abs(result["values"] - TRUTH) / result["half_widths"]
-    assert errors.max() < 2.2 and (errors < 1.0).sum() >= 11, errors  # 6.5 and more without the parabola
+    assert errors.max() < 2.2 and (errors < 1.0).sum() >= 11, errors  # 6.5 of the last fit alone
     np.testing.assert_allclose(result["noise"], [[5e-5] * 3, [0.005] * 3], rtol=0.1)
     before, after = result["held_out"]
     np.testing.assert_allclose(after, [[5e-5] * 3, [0.005] * 3], rtol=0.1)

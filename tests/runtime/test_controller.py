@@ -290,7 +290,7 @@ def test_why_it_was_stopped(policy):
 
 
 def test_before_the_first_state(policy):
-    """A robot that is silent is told from one whose messages are all damaged."""
+    """The reason distinguishes a silent robot from one whose messages are all damaged."""
     for faults, expected in ((Faults(silent=True), "not said anything"), (Faults(damaged=1.0), "messages are damaged")):
         world = World(policy)
         world.robot.faults = faults
