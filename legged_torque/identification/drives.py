@@ -3,7 +3,7 @@
 import warp as wp
 
 TAU, POS, VEL, KP, KD = (wp.constant(number) for number in range(5))  # rows of a command
-BIAS, DELAY = wp.constant(3), wp.constant(4)  # rows of a candidate
+VISCOUS, BIAS, DELAY = (wp.constant(row) for row in (1, 3, 4))  # rows of a candidate
 Rows, Table = wp.array2d(dtype=wp.float32), wp.array3d(dtype=wp.float32)
 
 
@@ -25,7 +25,8 @@ def drive(
     limits: Rows,  # lowest and highest torques [N m], (2, joints)
     trunk: wp.array(dtype=wp.float32),  # its position and orientation (7,)
     candidates: Table,  # (worlds, 5, joints)
-    past: Rows,  # velocities one step ago [rad/s], (worlds, joints)
+    past: Rows,  # velocities before the last step [rad/s], (worlds, joints)
+    ahead: Rows,  # what was added to them for it [rad/s], (worlds, joints)
     qpos: Rows,
     qvel: Rows,
     ctrl: Rows,
@@ -34,15 +35,21 @@ def drive(
     """Write the torque of one joint of one world and, at the start of a tick, what its encoder says.
 
     Semi-implicit steps hold velocities of half a step ago, and a torque acts half a step before and after its time.
-    So velocities are extrapolated by half a step, and a torque is the mean of the commands in its step.
+    So a step starts from velocities that are extrapolated by half of it, which is taken back afterwards; viscous
+    friction is explicit; and a torque is the mean of the commands in its step. The error is then of second order.
     """
     world, place = wp.tid()
     joint = joints[place]
     step = taken[world, place]
     taken[world, place] = step + 1
+    added = ahead[world, place]
+    held = qvel[world, 6 + joint] - added
+    ahead[world, place] = 0.5 * (held - past[world, place])
+    past[world, place] = held
+    vel = held + ahead[world, place]
+    qvel[world, 6 + joint] = vel
+    qpos[world, 7 + joint] = qpos[world, 7 + joint] - added / rate
     pos = qpos[world, 7 + joint] - candidates[world, BIAS, place]
-    vel = 1.5 * qvel[world, 6 + joint] - 0.5 * past[world, place]
-    past[world, place] = qvel[world, 6 + joint]
     if step % substeps == 0 and step / substeps < seen.shape[0]:
         seen[step / substeps, world, 0, place] = pos
         seen[step / substeps, world, 1, place] = vel
@@ -51,7 +58,8 @@ def drive(
     share = late - wp.floor(late)
     torque = (1.0 - share) * asked(commands, newest, substeps, place, pos, vel)
     torque += share * asked(commands, newest - 1, substeps, place, pos, vel)
-    ctrl[world, joint] = wp.clamp(torque, limits[0, place], limits[1, place])
+    torque = wp.clamp(torque, limits[0, place], limits[1, place])
+    ctrl[world, joint] = torque - candidates[world, VISCOUS, place] * vel
     if place == 0:
         for i in range(7):
             qpos[world, i] = trunk[i]

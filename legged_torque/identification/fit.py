@@ -27,8 +27,8 @@ BIAS, DELAY = 0.1, 0.02  # largest [rad, s], as of PACE; explicit steps of a sim
 GENERATIONS, SIGMA, SEED = 10, 0.25, 1  # of CMA-ES; sigma in units of what is searched
 DIFFERENCE = 0.002  # for derivatives, in units of what is searched
 STEPS, GAIN = 30, 0.1  # of Gauss-Newton: at most, and of the logarithm of the likelihood in the last one
-FINER = (1, 2, 4)  # how many times as many physics steps each fit takes
-ROUNDS = GENERATIONS + len(FINER) * STEPS  # at most
+FINER = 4  # how many times as many physics steps the second fit takes
+ROUNDS = GENERATIONS + 2 * STEPS  # at most
 LEAST_NOISE = np.array([[1e-5], [1e-3]])  # [rad, rad/s] what Unitree's encoders resolve, over sqrt(12)
 BLOCK = 0.25  # [s] after which residuals are taken as independent
 QUANTILE = 1.96  # of 95%
@@ -45,7 +45,7 @@ class Identified:
     Attributes:
         values, half_widths: :data:`PARAMETERS` by joint, and their 95% intervals either way. Shapes: (5, joints).
         noise: Root mean square of residuals, positions [rad] and velocities [rad/s]. Shape: (2, joints).
-        held_out: The same where nothing was fitted, of the robot's file and of the last fit. Shape: (2, 2, joints).
+        held_out: The same where nothing was fitted, of the robot's file and of the second fit. Shape: (2, 2, joints).
     """
 
     values: np.ndarray
@@ -57,18 +57,16 @@ class Identified:
 def identify(cfg: Any, recording: Recording, device: str, progress: Callable[[], None] = lambda: None) -> Identified:
     """Return which drives of a task's robot explain a recording; a UserError names numbers that it does not tell.
 
-    Physics steps of length h bias a fit by a h + b h^2, which is more than noise does. Hence there are three fits with
-    ever shorter steps, and a parabola through them gives the numbers at h = 0. ``progress`` is called after each
-    round, of which there are ROUNDS at most.
+    Physics steps of length h bias a fit by a h^2, which may be more than what noise does. So there is a second fit with
+    shorter steps, and both give the numbers at h = 0. ``progress`` is called after each round, of which there are
+    ROUNDS at most.
     """
-    problems, fits = [Problem(HangingRobots(cfg, recording, device, times), recording) for times in FINER], []
-    numbers = problems[0].search(progress)
-    for problem in problems:
-        numbers, noise, equations = problem.refine(numbers, progress)
-        fits.append(numbers)
-    values, last = np.linalg.solve(np.vander(1.0 / np.array(FINER)), np.array(fits))[-1], problems[-1]
-    half_widths = last.spread(last.half_widths(values, equations))
-    return Identified(last.spread(last.clip(values)), half_widths, noise, last.held_out(numbers))
+    coarse, fine = (Problem(HangingRobots(cfg, recording, device, times), recording) for times in (1, FINER))
+    first, *_ = coarse.refine(coarse.search(progress), progress)
+    second, noise, equations = fine.refine(first, progress)
+    values = second + (second - first) / (FINER**2 - 1)
+    half_widths = fine.spread(fine.half_widths(values, equations))
+    return Identified(fine.spread(fine.clip(values)), half_widths, noise, fine.held_out(second))
 
 
 class Problem:

@@ -61,13 +61,16 @@ class HangingRobots:
         self.file_values = np.array([*(getattr(model, field)[6:][order] for field in FIELDS.values()), none, none])
         hang_up(model)
         model.opt.timestep, sim = self._step, cfg.sim
+        model.dof_damping[6:] = model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0  # drives do that
         self._engine = make_engine("fused", model, self.num_worlds, device, sim.solver_iterations, sim.ls_iterations)
-        self._fields = [self._engine.field(field, range(6, model.nv)) for field in FIELDS.values()]
+        fields = (self._engine.field(name, range(6, model.nv))[:, 6:] for name in FIELDS.values())
+        self._armature, _, self._coulomb_friction = fields
         tables = (recording.commands, self.torque_limits, [0.0, 0.0, 1.0, *recording.quaternion])
         self._tables = [torch.tensor(order, dtype=torch.int32, device=device), *map(self._tensor, tables)]
         shape = (self.num_worlds, len(order))
         self._taken = torch.zeros(shape, dtype=torch.int32, device=device)
-        self._values, self._past = (torch.zeros(*size, device=device) for size in ((shape[0], 5, shape[1]), shape))
+        self._values = torch.zeros(shape[0], 5, shape[1], device=device)
+        self._past, self._ahead = (torch.zeros(shape, device=device) for _ in range(2))
         self._seen = torch.zeros(len(recording.commands), shape[0], 2, shape[1], device=device)
         self._graph = CudaGraph(self._run_ticks, device)
 
@@ -91,10 +94,10 @@ class HangingRobots:
         everywhere = torch.ones(self.num_worlds, dtype=torch.bool, device=engine.device)
         self._values.copy_(self._tensor(parameters))
         self._past.copy_(start[1].expand_as(self._past))
+        self._ahead.zero_()
         self._taken.zero_()
         engine.reset(everywhere)
-        for number, field in enumerate(self._fields):
-            field[:, 6:][:, order] = self._values[:, number]
+        self._armature[:, order], self._coulomb_friction[:, order] = self._values[:, 0], self._values[:, 2]
         engine.update_constants(everywhere)
         engine.qpos[:, 7:][:, order], engine.qvel[:, 6:][:, order] = start[0] + self._values[:, 3], self._past
         engine.applied_forces()[0][:, 1, :3] = self._tensor(-model.body_mass[1] * model.opt.gravity)
@@ -105,7 +108,8 @@ class HangingRobots:
     def _run_ticks(self) -> None:
         """Simulate some ticks; what encoders say is kept up to the end of the log."""
         engine = self._engine
-        tensors = [*self._tables, self._values, self._past, engine.qpos, engine.qvel, engine.ctrl, self._seen]
+        own = (self._values, self._past, self._ahead)
+        tensors = [*self._tables, *own, engine.qpos, engine.qvel, engine.ctrl, self._seen]
         inputs = [wp.from_torch(self._taken), self._substeps, 1.0 / self._step, *map(wp.from_torch, tensors)]
         launch = wp.launch(drive, self._past.shape, inputs, device=engine.device, record_cmd=True)
         for _ in range(TICKS * self._substeps):

@@ -15,7 +15,8 @@ STEP, THIGH = 5e-4, "FR_thigh_joint"
 
 def test_same_as_sysid(leg):
     """Armature and Coulomb friction of the thigh, from its positions."""
-    recording, spec, params = record(leg, sweep(2.0), step=STEP), fixed(leg, STEP), sysid.ParameterDict()
+    recording, spec, params = record(leg, sweep(2.0)), fixed(leg, STEP), sysid.ParameterDict()
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     for motor, bias in zip(spec.actuators, TRUTH[3], strict=True):
         motor.biastype, motor.biasprm[:3] = mujoco.mjtBias.mjBIAS_AFFINE, (20.0 * bias, -20.0, -0.5)
         motor.ctrllimited = False

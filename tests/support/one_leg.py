@@ -2,6 +2,7 @@
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import mujoco
@@ -13,6 +14,7 @@ from legged_torque.identification.recording import Recording
 from legged_torque.runtime.controller import Mode
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.runtime.log import Log
+from tools.coverage import simulate
 
 PERIOD, NOISE = 0.002, np.array([[5e-4], [0.05]])  # [s]; [rad, rad/s]
 TILT = np.array([0.98, 0.1, -0.15, 0.08]) / np.linalg.norm([0.98, 0.1, -0.15, 0.08])  # of the trunk
@@ -42,9 +44,14 @@ def one_leg(folder):
     return cfg
 
 
+def fixed_file(leg):
+    """The file of the leg on a fixed trunk."""
+    return leg.asset.file.replace("leg.xml", "fixed.xml")
+
+
 def fixed(leg, step):
     """The specification of the leg on a fixed trunk, which touches nothing."""
-    spec = mujoco.MjSpec.from_file(leg.asset.file.replace("leg.xml", "fixed.xml"))
+    spec = mujoco.MjSpec.from_file(fixed_file(leg))
     spec.option.timestep, spec.option.disableflags = step, mujoco.mjtDisableBit.mjDSBL_CONTACT
     return spec
 
@@ -59,26 +66,12 @@ def sweep(seconds, last=10.0, amplitude=0.25):
     return np.array(list(POSE.values())) + size[:, None] * np.sin(phase[:, None] + 2.4 * np.arange(3))
 
 
-def record(leg, targets, step=1e-4, half=0.0):
-    """The recording of a leg without noise, whose drives close their loops at every physics step.
-
-    With a ``half``, as it should be, they know velocities that much ahead, and get commands that much later, in steps.
-    """
-    data, bias, substeps = mujoco.MjData(model := fixed(leg, step).compile()), TRUTH[3], round(PERIOD / step)
-    commands, measured, past = np.zeros((len(targets), 5, 3)), [], np.zeros(3)
+def record(leg, targets):
+    """The recording of a leg without noise."""
+    commands = np.zeros((len(targets), 5, 3))
     commands[:, 1], commands[:, 3], commands[:, 4] = targets, 20.0, 0.5
-    whole, share = divmod(TRUTH[4, 0] / step + half + 1e-9, 1.0)
-    data.qpos[:] = targets[0] + bias
-    for number in range(-round(0.5 / step), len(targets) * substeps):
-        pos, vel = data.qpos - bias, data.qvel + half * (data.qvel - past)
-        past = data.qvel.copy()
-        if number >= 0 and number % substeps == 0:
-            measured.append((pos, vel))
-        sent = [commands[max(int(number - whole - more), 0) // substeps] for more in (0, 1)]
-        torques = [kp * (q - pos) + kd * (dq - vel) for _, q, dq, kp, kd in sent]
-        data.ctrl[:] = (1.0 - share) * torques[0] + share * torques[1]
-        mujoco.mj_step(model, data)
-    return Recording(list(POSE), PERIOD, TILT, commands, np.array(measured))
+    measured = simulate(Path(fixed_file(leg)), list(POSE), commands, TRUTH)
+    return Recording(list(POSE), PERIOD, TILT, commands, measured)
 
 
 def noisy(recording, seed=0):

@@ -3,9 +3,10 @@
 import sys
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
-from support.one_leg import NOISE, POSE, TRUTH, one_leg, record, sweep
+from support.one_leg import NOISE, PERIOD, POSE, TRUTH, fixed, one_leg, record, sweep
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
@@ -16,11 +17,20 @@ from tools import coverage
 
 def test_simulation(tmp_path):
     """Short semi-implicit steps, in which drives compute torques themselves, go to the same places."""
-    expected = record(one_leg(tmp_path), sweep(0.6), step=5e-5, half=0.5)
-    measured = coverage.simulate(tmp_path / "fixed.xml", list(POSE), expected.commands, TRUTH)
-    np.testing.assert_allclose(measured[:, 0], expected.measured[:, 0], atol=2e-5)
-    np.testing.assert_allclose(measured[:, 1], expected.measured[:, 1], atol=2e-3)
-    assert np.ptp(measured[:, 0], axis=0).min() > 0.1
+    leg, step = one_leg(tmp_path), 5e-5
+    recording = record(leg, sweep(0.6))
+    data, substeps, bias = mujoco.MjData(model := fixed(leg, step).compile()), round(PERIOD / step), TRUTH[3]
+    data.qpos[:], measured, past = np.add([*POSE.values()], bias), [], np.zeros(3)
+    for number in range(-10000, 300 * substeps):
+        pos, vel, past = data.qpos - bias, 1.5 * data.qvel - 0.5 * past, data.qvel.copy()
+        if number >= 0 and number % substeps == 0:
+            measured.append((pos, vel))
+        target = sum(recording.commands[max(number - late, 0) // substeps, 1] for late in (100, 101)) / 2
+        data.ctrl[:] = 20.0 * (target - pos) - 0.5 * vel
+        mujoco.mj_step(model, data)
+    for number, atol in enumerate((2e-5, 2e-3)):
+        np.testing.assert_allclose(recording.measured[:, number], np.array(measured)[:, number], atol=atol)
+    assert np.ptp(recording.measured[:, 0], axis=0).min() > 0.1
 
 
 def test_noise_and_numbers(monkeypatch):
