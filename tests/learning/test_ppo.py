@@ -26,7 +26,7 @@ from support.settings import error_of
 from torch import nn
 
 from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.ppo import LOSS_NAMES
+from legged_torque.learning.ppo import LOSS_NAMES, cpu_ppo
 from legged_torque.learning.ppo.cpu_ppo import run_network
 
 
@@ -330,8 +330,10 @@ def test_elu_on_a_cpu():
     torch.testing.assert_close(*found, rtol=0.0, atol=1.2e-7, equal_nan=True)
 
 
-def test_linear_layer_on_a_cpu():
+@pytest.mark.parametrize("use_onednn", [False, torch.backends.mkldnn.is_available()])
+def test_linear_layer_on_a_cpu(monkeypatch, use_onednn):
     """It and its gradients are those of float64 to rounding."""
+    monkeypatch.setattr(cpu_ppo, "USE_ONEDNN", use_onednn)
     torch.manual_seed(1)
     layer, inputs, weights = nn.Linear(45, 128), torch.randn(300, 45), torch.randn(300, 128)
     found = []
