@@ -86,8 +86,8 @@ class Health:
         if torch.distributed.is_initialized():
             distributed.average([numbers])
         share, *means = numbers.tolist()
-        counts = [round(mean * distributed.world_size()) for mean in means]
-        return share, {tensor: count for tensor, count in zip(self._watched, counts, strict=True) if count}
+        found = ((tensor, mean) for tensor, mean in zip(self._watched, means, strict=True) if mean)
+        return share, {tensor: round(mean * distributed.world_size()) for tensor, mean in found}
 
 
 def columns(i: int, numbers: Tensor) -> list[Any]:

@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 CODE_NAMES = ("class_name", "function", "_func")
 """Ends of the names of settings that name a class or a function, ``"module:Class"`` or a name in rsl_rl."""
 PPO = "legged_torque.learning.ppo:OnDevicePPO"
-SECTIONS = ("algorithm.", "actor.", "critic.", "flashsac.", "distillation.", "pretraining.file", "pretraining.critic")
+_OF_PPO = ("algorithm.", "actor.", "critic.", "pretraining.file", "pretraining.critic_warmup_iterations")
+SECTIONS = (*_OF_PPO, "flashsac.", "distillation.")
 READ = {
-    PPO: ("algorithm.", "actor.", "critic.", "pretraining.file", "pretraining.critic_warmup_iterations"),
+    PPO: _OF_PPO,
     FLASHSAC: (
         "flashsac.",
         *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision", "symmetry_cfg.")),
