@@ -127,24 +127,38 @@ def after(seconds):
 def test_laptop():
     """Minutes of training on two cores until evaluations track 70 and 80%, and tracking at the end."""
     data = pd.read_csv(DOCS / "results" / "laptop.csv.gz")
+    flash = data[data["task"].str.endswith("flashsac")].iloc[-1]
+    said = f"Xeon, {flash['steps']:,.0f} steps took {flash['seconds'] / 60:.0f} minutes"
+    assert said in text_of("howto/learner.md", "- On two cores of a")
+    data = data[~data["task"].str.endswith("flashsac")]
+    on_xeon = data["commit"].isin(["db0ae3b", "a2590d6"])
+    walked = data[on_xeon & (data["track_percentage"] >= 0.7)].groupby(["task", "seed"])["seconds"].min()
+    text = text_of("getting_started.md", "On two cores of Xeons").replace("\n", " ")
+    for task, words in (
+        ("go2_torque_multihead", "took {} to {} until 70%"),
+        ("a1_position", "{} to {} (`--seed`"),
+    ):
+        assert f"`{task}` {words.format(*after([walked[task].min(), walked[task].max()]))}" in text
+        assert len(walked[task]) == 4
+    assert f"`a1_torque_multihead` {after(walked['a1_torque_multihead'])[0]} (seed 1, a2590d6" in text
     _, rows = rows_of("getting_started.md", "task")
     for task, *cells in rows:
-        of_task = data[data["task"] == task.strip("`")]
+        of_task = data[(data["task"] == task.strip("`")) & ~on_xeon]
         for share, cell in zip((0.7, 0.8), cells, strict=True):
             seconds = of_task[of_task["track_percentage"] >= share].groupby("seed")["seconds"].min()
             assert list(seconds.index) == [1, 2, 3, 4] and cell == ", ".join(after(seconds)), (task, share)
     runs = data.groupby(["task", "seed", "commit"])[["steps", "seconds"]].max()
-    speeds, minutes = runs["steps"] / runs["seconds"], runs[runs["steps"] > 19e6]["seconds"] / 60
+    speeds = runs["steps"] / runs["seconds"]
     _, rows = rows_of("getting_started.md", "| GPU (H200)")
     said = {name: cell for name, *_, cell in rows}
     assert said["steps per second"] == " to ".join(f"{round(speed, -2):,.0f}" for speed in (speeds.min(), speeds.max()))
-    assert said["the default training takes"] == f"{20e6 / speeds.max() / 60:.0f} to {minutes.max():.0f} minutes"
+    minutes = [20e6 / speed / 60 for speed in (speeds.max(), speeds.min())]
+    assert said["the default training takes"] == "{:.0f} to {:.0f} minutes".format(*minutes)
     last = data[(data["steps"] > 0.82 * 20e6) & (data["seed"] == 1)].groupby("task")["track_percentage"]
     assert (last.size() == 8).all()
     ends = [f"{end:.2f}" for end in last.mean()]
     text = text_of("getting_started.md", "last 18% of the steps, seed 1 tracked")
     assert text.startswith(f"{ends[0]} (A1, ") and f" and {ends[1]} (Go2" in text
-    assert "tracks {} (A1) and {} (Go2) at the end".format(*ends) in text_of("tried.md", "**At the end of 20 million")
     runs, _ = laptop_settings()
     ends = runs[runs["other"] == f"{KEPT} fade 4-10M 20M"].groupby(["task", "seed"]).apply(at_the_end)[:, 1]
     rough = ends.pop("a1_rough_torque_multihead")
