@@ -293,9 +293,15 @@ def test_students():
 
 def test_coverage():
     """Errors of identified numbers, and how many of their intervals held."""
-    data, text = pd.read_csv(DOCS / "results" / "coverage.csv.xz"), text_of("howto/identify.md", "Physics steps bias")
-    text, seconds = text.replace("\n", " "), data.groupby("trial")["seconds"].first()
-    alone, data = seconds.pop(100), data[data["trial"] < 100]
+    data, text = (
+        pd.read_csv(DOCS / "results" / "coverage.csv.xz"),
+        text_of("howto/identify.md", "Physics steps can bias"),
+    )
+    text, seconds = text.replace("\n", " "), data.groupby(["commit", "trial"])["seconds"].first()
+    on_core, seconds = sorted(seconds.loc["2287a70"]), seconds.loc["db0ae3b"]
+    alone, seconds = seconds[100], seconds.drop(100)
+    data = data[(data["trial"] < 100) & (data["commit"] == "db0ae3b")]
+    assert "and {:.0f} and {:.0f} s on a core".format(*on_core) in text
     assert data["trial"].nunique() == 100 and f"{100.0 * data['held'].mean():.1f}% of the intervals held" in text
     held = 100.0 * data.groupby("parameter")["held"].mean()
     for kind, share in held.items():
@@ -303,7 +309,9 @@ def test_coverage():
     largest = data.assign(error=data["error"].abs(), share=(data["error"] / data["truth"]).abs()).groupby("parameter")
     share = 100.0 * largest["share"].max()[["armature", "viscous_friction", "coulomb_friction"]].max()
     error = 1e3 * largest["error"].max()
-    assert f"by at most {share:.1f}%, biases by {error['bias']:.1f} mrad, delays by {error['delay']:.4f} ms" in text
+    said = re.search(r"by at most ([\d.]+)%, biases by ([\d.]+) mrad, delays by ([\d.]+) ms", text)
+    for most, largest in zip(map(float, said.groups()), (share, error["bias"], error["delay"]), strict=True):
+        assert 0.85 * most < largest <= most
     assert f"{alone:.0f} s alone on an H200, {seconds.min():.0f} to {seconds.max():.0f} s beside nine others" in text
 
 

@@ -21,7 +21,7 @@ def test_simulation(tmp_path):
     recording = record(leg, sweep(0.6))
     data, substeps, bias = mujoco.MjData(model := fixed(leg, step).compile()), round(PERIOD / step), TRUTH[3]
     data.qpos[:], measured, past = np.add([*POSE.values()], bias), [], np.zeros(3)
-    for number in range(-10000, 300 * substeps):
+    for number in range(-round(coverage.SETTLE / step), len(recording.commands) * substeps):
         pos, vel, past = data.qpos - bias, 1.5 * data.qvel - 0.5 * past, data.qvel.copy()
         if number >= 0 and number % substeps == 0:
             measured.append((pos, vel))
