@@ -102,7 +102,7 @@ def test_steps_of_physics(leg, monkeypatch):
     """Two fits bring armature and delay, which steps bias most, nearer to the truth than the better one alone."""
     monkeypatch.setattr(fit, "FINER", 2)
     monkeypatch.setattr(fit, "GENERATIONS", 2)
-    recording = quiet(record(leg, sweep(4.0)))
+    recording = quiet(record(leg, sweep(6.0)))
     found = fit.identify(leg, recording, "cpu")
     second, *_ = fit.Problem(HangingRobots(leg, recording, "cpu", 2), recording).refine(NUMBERS, lambda: None)
     numbers, half = (np.append(each[0], each[4, 0]) for each in (found.values, found.half_widths))
