@@ -61,7 +61,7 @@ class HangingRobots:
         self.file_values = np.array([*(getattr(model, field)[6:][order] for field in FIELDS.values()), none, none])
         hang_up(model)
         model.opt.timestep, sim = self._step, cfg.sim
-        model.dof_damping[6:] = model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0  # the kernel does
+        model.dof_damping[6:] = model.actuator_ctrllimited[:] = model.actuator_forcelimited[:] = 0  # drive applies them
         self._engine = make_engine("fused", model, self.num_worlds, device, sim.solver_iterations, sim.ls_iterations)
         fields = (self._engine.field(name, range(6, model.nv))[:, 6:] for name in FIELDS.values())
         self._armature, _, self._coulomb_friction = fields

@@ -293,11 +293,9 @@ def test_students():
 
 def test_coverage():
     """Errors of identified numbers, and how many of their intervals held."""
-    data, text = (
-        pd.read_csv(DOCS / "results" / "coverage.csv.xz"),
-        text_of("howto/identify.md", "Physics steps can bias"),
-    )
-    text, seconds = text.replace("\n", " "), data.groupby(["commit", "trial"])["seconds"].first()
+    data = pd.read_csv(DOCS / "results" / "coverage.csv.xz")
+    text = text_of("howto/identify.md", "Physics steps can bias").replace("\n", " ")
+    seconds = data.groupby(["commit", "trial"])["seconds"].first()
     on_core, seconds = sorted(seconds.loc["2287a70"]), seconds.loc["db0ae3b"]
     alone, seconds = seconds[100], seconds.drop(100)
     data = data[(data["trial"] < 100) & (data["commit"] == "db0ae3b")]
@@ -310,8 +308,8 @@ def test_coverage():
     share = 100.0 * largest["share"].max()[["armature", "viscous_friction", "coulomb_friction"]].max()
     error = 1e3 * largest["error"].max()
     said = re.search(r"by at most ([\d.]+)%, biases by ([\d.]+) mrad, delays by ([\d.]+) ms", text)
-    for most, largest in zip(map(float, said.groups()), (share, error["bias"], error["delay"]), strict=True):
-        assert 0.85 * most < largest <= most
+    for most, found in zip(map(float, said.groups()), (share, error["bias"], error["delay"]), strict=True):
+        assert 0.85 * most < found <= most
     assert f"{alone:.0f} s alone on an H200, {seconds.min():.0f} to {seconds.max():.0f} s beside nine others" in text
 
 

@@ -93,6 +93,9 @@ def test_mjlab():
     seconds = [row["seconds_to_70"] - row["start_up_s"] for row in DATA[-1]["rows"] if "seconds_to_70" in row]
     said = "{:.0f} s after the first iteration on MuJoCo Warp (288b895), {:.1f} s with the fused engine and our"
     assert said.format(*seconds) in text and len(seconds) == 2
+    equal = DATA[-1]["rows"][1]
+    said = f"{equal['tracking_after_iterations'][-1][0]} iterations were too few (7657c06 needed"
+    assert f"{said} {equal['earlier']['iterations_to_70']})" in text
 
 
 def test_counters():
