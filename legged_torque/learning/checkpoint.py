@@ -49,8 +49,11 @@ class Background:
 
 
 def on_host(content: Any) -> Any:
-    """Return nested containers with copies of all tensors, in the memory of the host."""
-    return tree_map_only(Tensor, lambda tensor: tensor.detach().to("cpu", copy=True), content)
+    """Return nested containers with copies of all tensors, in the memory of the host; waits once for all of them."""
+    copies = tree_map_only(Tensor, lambda tensor: tensor.detach().to("cpu", non_blocking=True, copy=True), content)
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return copies
 
 
 def cloned(state: dict[str, Any]) -> dict[str, Any]:
