@@ -62,12 +62,14 @@ class Keyboard:
     """Turns key presses in the window's thread into requests."""
 
     def __init__(self, session: Session) -> None:
-        """Start with the command 0 in place of random ones."""
+        """Start with the session's command, or with the command 0 in place of random ones."""
         self._session = session
         ranges = session.task.cfg.commands.ranges
         self._limits = [ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]
-        self._command = [0.0, 0.0, 0.0]
-        self.press(STAND_STILL)
+        session.carry_out_requests()  # the command line's command may be among them; nothing steps yet
+        self._command = list(session.command or (0.0, 0.0, 0.0))
+        if not session.command:
+            self.press(STAND_STILL)
 
     def press(self, key: int) -> None:
         """Request the action of a key, given by its code of GLFW."""
@@ -76,7 +78,8 @@ class Keyboard:
         elif key in COMMAND_KEYS:
             index, change = COMMAND_KEYS[key]
             low, high = self._limits[index]
-            self._command[index] = round(min(max(self._command[index] + change, low), high), 3)
+            now = self._command[index]  # may be beyond the limits
+            self._command[index] = round(min(max(now + change, min(low, now)), max(high, now)), 3)
         elif key == STAND_STILL:
             self._command = [0.0, 0.0, 0.0]
         if key in COMMAND_KEYS or key == STAND_STILL:

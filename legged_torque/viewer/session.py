@@ -60,7 +60,7 @@ class Session:
     """
 
     companion: "Session | None" = None  # another policy, which steps with this one under the followed world's command
-    snapshot: Snapshot | None = None  # the last step; None before the first
+    snapshot: Snapshot | None = None  # the last step, and what users have changed since; None before the first
     sim_time = 0.0  # simulated time since the start [s]
     is_paused = False
     world = 0  # the followed world
@@ -159,12 +159,18 @@ class Session:
     def _adopt(self, task: WatchedRobot) -> None:
         """Continue with a task: the first one, or one with another perturbation."""
         self.task = self._runner.env = task
-        self.snapshot, self.falls = None, 0
+        self.falls = 0
         self.history.clear()
         self.hold(self.command)
         self._apply_mixing()
         self._obs = task.reset()
+        self._look()
         self.pacer.restart()
+
+    def _look(self) -> None:
+        """Show what a request has changed, since no step may follow: the session may be paused."""
+        if self.snapshot:
+            self.snapshot = self.task.snapshot(self.sim_time, self.world)
 
     def hold(self, command: Command | None) -> None:
         """Give all worlds a command, or those of the training, from the next step on."""
@@ -209,6 +215,7 @@ class Session:
         """Start a new episode in every world."""
         with torch.no_grad():
             self._obs = self.task.reset()
+        self._look()
         if self.companion:
             self.companion.reset()
         self.message = Message("reset")
@@ -221,8 +228,11 @@ class Session:
             raise UserError("there are no tiles on a plane")
         ground.levels[world] = min(max(level, 0), ground.layout.num_rows - 1)
         ground.columns[world] = min(max(column, 0), ground.layout.num_cols - 1)
+        begun = self.task.reset_buf.clone()
         with torch.no_grad():
             self._obs = self.task.reset(world)
+        self.task.reset_buf.logical_or_(begun)  # policies have not forgotten those episodes yet
+        self._look()
         self.message = Message(f"robot {world} is on a new tile")
 
     @request
@@ -236,8 +246,7 @@ class Session:
         """Choose the world whose values are shown."""
         self.history.clear()
         self.world = min(max(world, 0), self.task.num_envs - 1)
-        if self.snapshot:
-            self.snapshot = self.task.snapshot(self.sim_time, self.world)
+        self._look()
 
     @request
     def set_mixing(self, weights: Sequence[float] | None) -> None:

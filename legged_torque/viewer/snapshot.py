@@ -50,6 +50,7 @@ class WatchedRobot(LeggedRobot):
         """Allocate the parts, and prepare the height scan."""
         super()._init_state()
         self._watched_scan, self._metrics = HeightScan(self.cfg.terrain, self.state), WalkingMetrics(self)
+        self._commands_before = self.commands.clone()
         self.torque_parts = torch.zeros(len(weighted_terms(self)), *self.dof_pos.shape, device=self.device)
 
     def _compute_torques(self, actions: Tensor) -> Tensor:
@@ -63,7 +64,7 @@ class WatchedRobot(LeggedRobot):
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Keep the commands, which a control step may draw anew at its end, make one, and measure it."""
-        self._commands_before = self.commands.clone()
+        self._commands_before.copy_(self.commands)
         result = super().step(actions)
         self._metrics.clear()
         self._metrics.add_step(self._commands_before)

@@ -7,7 +7,7 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -91,7 +91,11 @@ class VideoRecorder:
         shown = list(enumerate(self.steps, start=1))[::STRIDE]
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / file.name
-            writer = imageio.get_writer(part, fps=round(1.0 / STRIDE / self._control_step), macro_block_size=1)
+            frame_step = STRIDE * self._control_step
+            timing: dict[str, Any] = {"fps": 1.0 / frame_step, "macro_block_size": 1}
+            if file.suffix.lower() == ".gif":
+                timing = {"duration": gif_durations(len(shown), frame_step)}
+            writer = imageio.get_writer(part, **timing)
             with renderer, writer, Counter("rendering, frame", len(shown)) as counter:
                 for frame, (number, step) in enumerate(shown, start=1):
                     seconds, tiles = number * self._control_step, []
@@ -151,13 +155,18 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
 
     shown = itertools.islice(imageio.v3.imiter(video, plugin="FFMPEG"), None, None, STRIDE)
     frames = np.stack([frame[::2, ::2].copy() for frame in shown])
-    duration = 1000.0 * STRIDE / imageio.v3.immeta(video, plugin="FFMPEG")["fps"]  # of a frame of the gif [ms]
+    duration = gif_durations(len(frames), STRIDE / imageio.v3.immeta(video, plugin="FFMPEG")["fps"])
     gif = imageio.v3.imwrite("<bytes>", frames, extension=".gif", duration=duration, loop=0)
     size = {"height": frames.shape[1], "width": frames.shape[2], "colorspace": 3}
     value = Summary.Value(tag="video", image=Summary.Image(**size, encoded_image_string=gif))
     writer = FileWriter(str(video.parent))
     writer.add_summary(Summary(value=[value]), iterations)
     writer.close()
+
+
+def gif_durations(count: int, step: float) -> list[int]:
+    """Return how long frames are shown [ms] that come every ``step`` [s]; a gif counts hundredths of seconds."""
+    return (10 * np.diff(np.round(100.0 * step * np.arange(count + 1)))).astype(int).tolist()
 
 
 def velocity_rows(time: float, command: np.ndarray, velocity: np.ndarray) -> list[Row]:

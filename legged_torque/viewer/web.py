@@ -134,13 +134,14 @@ class Page:
         for control, attribute, value in self._shown:
             now = value()
             if isinstance(control, viser.GuiSliderHandle):
-                now = round(min(max(now, control.min), control.max), 2)
+                now = round(now, 2)  # other sliders command what this one shows: its range must contain the value
+                control.min, control.max = min(control.min, now), max(control.max, now)
             if getattr(control, attribute) != now:  # each change is a message to the browsers
                 setattr(control, attribute, now)
 
     def _draw_status(self) -> None:
-        """Write checkpoint, time, companion, tile on rough ground and message."""
-        session, message = self._session, self._session.message
+        """Write checkpoint, time, companion, tile on rough ground, message, and an error of the companion."""
+        session, messages = self._session, [self._session.message]
         running = "paused" if session.is_paused else f"{session.pacer.rate:.2f} x real time"
         lines = [
             f"<b>model_{session.checkpoint}</b>, after {session.trained_steps / 1e6:,.1f} million steps",
@@ -148,10 +149,12 @@ class Page:
         ]
         if other := session.companion:
             lines.append(f"companion: <b>{html.escape(other.name)}</b>, model_{other.checkpoint}, {other.falls} falls")
+            messages += [other.message] if other.message.is_error else []
         if self._ground and session.snapshot and session.snapshot.tile:
             lines.append(self._ground.tile_text(*session.snapshot.tile))
-        kind = "lt-error" if message.is_error else ""
-        lines.append(f'<span class="{kind}">{html.escape(message.text) or "&nbsp;"}</span>')
+        for message in messages:
+            kind = "lt-error" if message.is_error else ""
+            lines.append(f'<span class="{kind}">{html.escape(message.text) or "&nbsp;"}</span>')
         self.status.content = f'<div class="lt-status">{"<br>".join(lines)}</div>'
 
     # ---- controls ----------------------------------------------------------------------------------------------------
@@ -240,9 +243,10 @@ class Page:
         """Add the commanded velocities. Moving a slider ends random commands."""
         gui, session, ranges = self._gui, self._session, self._session.task.cfg.commands.ranges
         random = gui.add_checkbox("random", True, hint="as in training, for each world")
-        limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
+        trained = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
+        limits = [(min(low, 0.0), max(high, 0.0)) for low, high in trained]
         sliders = [
-            gui.add_slider(label, low, max(high, low + STEP), STEP, low, hint=hint)
+            gui.add_slider(label, low, max(high, low + STEP), STEP, 0.0, hint=hint)
             for (label, hint), (low, high) in zip(COMMANDS.items(), limits, strict=True)
         ]
 
@@ -251,8 +255,8 @@ class Page:
             return session.command or drawn
 
         def steer(shares: Command) -> None:
-            pairs = zip(sliders, shares, strict=True)
-            x, y, yaw = (share * (slider.max if share > 0.0 else -slider.min) for slider, share in pairs)
+            pairs = zip(limits, shares, strict=True)
+            x, y, yaw = (share * (high if share > 0.0 else -low) for (low, high), share in pairs)
             session.set_command((x, y, yaw))
 
         self._bind_sliders(sliders, command, random, lambda: session.command is None, session.set_command)

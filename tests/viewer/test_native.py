@@ -18,6 +18,7 @@ def session(tmp_path_factory):
 
 def test_keys(session):
     """They change commands within the limits of the training, push, pause and reset."""
+    session.set_command(None)
     keyboard = native.Keyboard(session)
     for key, count in ((265, 3), (264, 1), (44, 15), (46, 1), (263, 2), (262, 3)):
         for _ in range(count):
@@ -35,6 +36,16 @@ def test_keys(session):
     keyboard.press(ord(" "))
     session.tick()
     assert not session.is_paused
+
+
+def test_command_of_the_command_line(session):
+    """It holds until keys change it, one component each, also beyond the limits of the training."""
+    session.set_command((3.0, 0.0, 0.25))
+    keyboard = native.Keyboard(session)
+    for key, command in ((0, (3.0, 0.0, 0.25)), (265, (3.0, 0.0, 0.25)), (263, (3.0, 0.0, 0.35))):
+        keyboard.press(key)
+        session.tick()
+        assert session.snapshot.commands[0].tolist() == pytest.approx(command)
 
 
 def test_what_is_drawn(session):

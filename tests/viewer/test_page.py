@@ -162,6 +162,31 @@ def test_controls_follow_the_session(page):
     wait_for(lambda: "lt-error" not in status(page))
 
 
+def test_sliders_show_what_is_commanded(tmp_path):
+    """They do beyond the ranges of the training too: moving one of them changes no other component of the command."""
+    ranges = {"commands.ranges.lin_vel_x": [0.3, 1.0]}
+    session = new_session(tmp_path, "a1_position", 1, clock=Clock(), **ranges)
+    page = Page(session, "title", "127.0.0.1", 8460)
+    forward, turning = control(page, "v_x [m/s]"), control(page, "yaw rate [rad/s]")
+
+    def choose(control, value):
+        send(type="GuiUpdateMessage", uuid=control._impl.uuid, updates={"value": value})
+        wait_for(lambda: session.requests)
+        session.tick()
+        return session.snapshot.commands[0].tolist()
+
+    with visitor(page.server) as send:
+        for v_x in (3.0, 0.0):
+            session.set_command((v_x, 0.0, 0.0))
+            session.tick()
+            wait_for(lambda v_x=v_x: (forward.value, turning.value) == (v_x, 0.0))
+            assert forward.min <= 0.0 and forward.max >= v_x
+            assert choose(turning, 0.5) == [v_x, 0.0, 0.5]
+        for share, v_x in ((1.0, 1.0), (-1.0, 0.0)):  # keys and sticks stay within the ranges of the training
+            assert choose(page._field, (share, 0.0, 0.0)) == [v_x, 0.0, 0.0]
+    page.close()
+
+
 @pytest.mark.parametrize(("host", "is_open"), [("127.0.0.1", False), ("0.0.0.0", True)])
 def test_what_is_printed(page, monkeypatch, capsys, host, is_open):
     """The address, with a token and a warning if other machines reach it."""
@@ -228,8 +253,11 @@ def test_metrics(tmp_path):
     assert page._plots._metrics.content == before
 
 
-def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch):
-    """In wide and high pictures, a camera sees both, with a third of a metre around them, also if far apart."""
+def test_two_robots(tmp_path, monkeypatch):
+    """In wide and high pictures, a camera sees both, with a third of a metre around them, also if far apart.
+
+    Errors of both are shown.
+    """
     session = new_session(tmp_path / "first", "a1_position", 1)
     session.companion = new_session(tmp_path / "other", "a1_position", 1)
     monkeypatch.setattr(scene, "SIDE", 1.9)
@@ -253,6 +281,10 @@ def test_two_robots_stay_in_the_picture(tmp_path, monkeypatch):
             session.tick()
             wait_for(lambda: page._scene._robots["companion"]._handles)
             wait_for(lambda client=client, aspect=aspect: are_in_sight(client, aspect))
+    for walking, number in ((session, 7), (session.companion, 8)):
+        walking.load_checkpoint(number)
+    session.tick()
+    wait_for(lambda: re.findall(r'lt-error">[^<]*(model_.\.pt)', status(page)) == ["model_7.pt", "model_8.pt"])
     page.close()
 
 

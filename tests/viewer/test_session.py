@@ -7,10 +7,12 @@ import threading
 import numpy as np
 import pytest
 import torch
+from rsl_rl.models import RNNModel
 from support.clock import Clock, wait_for
 from support.sessions import new_session
 from support.tilted import tilted
 
+from legged_torque.learning.memory import acting
 from legged_torque.viewer import session as session_module
 from legged_torque.viewer.pacing import MAX_LAG, Pacer
 from legged_torque.viewer.session import AS_LOADED, SCAN_INTERVAL
@@ -127,6 +129,7 @@ def test_pause_and_reset(make_session):
     assert session.is_paused and session.sim_time == sim_time and torch.equal(session.task.sim.qpos, qpos)
     ask(session.reset)
     torch.testing.assert_close(session.task.base_pos[:, 2], torch.full((NUM_ENVS,), 0.4))
+    np.testing.assert_allclose(session.snapshot.qpos[:, 2], 0.4)
     assert session.task.episode_length_buf.tolist() == [0] * NUM_ENVS
     ask(session.set_paused, False)
     assert session.sim_time > sim_time
@@ -246,12 +249,30 @@ def test_tiles(make_session):
     assert ground.levels.tolist() == [2, 1] and ground.columns.tolist() == [1, 1]
     middle = torch.tensor([6.0, 3.0, -2 / 3 + 0.4])  # of a pit in the last of three rows and the second of two columns
     torch.testing.assert_close(task.base_pos[0], middle, atol=1e-4, rtol=0.0)
+    np.testing.assert_allclose(session.snapshot.qpos[0, :3], middle, atol=1e-4)
+    assert session.snapshot.tile == (2, 1)
     assert torch.equal(task.sim.qpos[1], other) and task.episode_length_buf.tolist() == [0, 3]
     session.set_tile(99, -1)
-    session.set_perturbation("low")
-    ask(session.set_paused, False, count=2)
+    ask(session.set_perturbation, "low")
     assert session.task is not task and session.task.terrain.levels.tolist() == [2, 1]
-    assert session.task.terrain.columns.tolist() == [0, 1] and session.snapshot.tile == (2, 0)
+    for is_paused in (True, False):
+        ask(session.set_paused, is_paused)
+        assert session.task.terrain.columns.tolist() == [0, 1] and session.snapshot.tile == (2, 0)
+
+
+def test_memory(make_session):
+    """A recurrent policy starts each episode with nothing, also if a tile is chosen between a reset and its step."""
+    session, _ = make_session("a1_torque", ground={"curriculum": False})
+    obs = session.task.get_observations()
+    model = RNNModel(obs, {"actor": ["policy"]}, "actor", session.task.num_actions, rnn_hidden_dim=8)
+    session._policy = acting(model, lambda: session.task)
+    ask(session.set_paused, False, count=3)
+    session.set_paused(True)
+    session.reset()
+    ask(session.set_tile, 1, 0)
+    seen = session._obs["policy"]
+    ask(session.set_paused, False)
+    torch.testing.assert_close(session.task.actions, model.mlp(model.rnn.rnn(seen[None])[0][0]))
 
 
 def test_requests_from_other_threads(make_session, monkeypatch):

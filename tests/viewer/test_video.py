@@ -33,16 +33,16 @@ from legged_torque.viewer.drawing import Drawing
 from legged_torque.viewer.video import VideoRecorder
 model = mujoco.MjModel.from_xml_path(sys.argv[1])
 qpos = model.key_qpos[0] if model.nkey else model.qpos0
-for robots in (1, 4):
-    recorder, frames = VideoRecorder(Drawing(model), 0.02), []
+for robots, rate, ending in ((1, 75.0, "gif"), (4, 25.0, "mp4")):
+    recorder, frames = VideoRecorder(Drawing(model), 1.0 / rate), []
     recorder.steps = 5 * [[np.tile(qpos, (robots, 1)), np.ones((robots, 3)), np.zeros((robots, 3))]]
-    recorder.write(Path(sys.argv[2]) / f"{robots}.mp4", None, lambda *frame: frames.append(frame))
+    recorder.write(Path(sys.argv[2]) / f"{robots}.{ending}", None, lambda *frame: frames.append(frame))
     assert frames == [(1, 3), (2, 3), (3, 3)], frames
 """
 
 
 def test_frames(tmp_path):
-    """An mp4 has every second step, and its size is that of all tiles; all of them show a robot."""
+    """A video has every second step in real time; its size is that of all tiles, which all show a robot."""
     for package in ("imageio", "imageio_ffmpeg"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[video]")
     import imageio
@@ -54,15 +54,19 @@ def test_frames(tmp_path):
     if result.stderr.startswith("no renderer: "):
         pytest.skip(result.stderr.strip())
     assert (result.returncode, result.stderr) == (0, "")
-    for side, width, height in ((1, 960, 540), (2, 1280, 720)):
-        with imageio.get_reader(tmp_path / "new" / f"{side**2}.mp4") as reader:
-            assert reader.get_meta_data()["fps"] == 25
-            frames = [np.asarray(frame) for frame in reader]
+    for side, width, height, ending in ((1, 960, 540, "gif"), (2, 1280, 720, "mp4")):
+        file = tmp_path / "new" / f"{side**2}.{ending}"
+        with imageio.get_reader(file) as reader:
+            fps, frames = reader.get_meta_data().get("fps"), [np.asarray(frame) for frame in reader]
         assert [frame.shape for frame in frames] == [(height, width, 3)] * 3
         for rows in np.split(frames[-1], side):
             for tile in np.split(rows, side, axis=1):
                 h, w = tile.shape[:2]
                 assert tile[h // 3 : -h // 4, w // 3 : -w // 3].min() < 40 < 150 < tile.mean()  # black on light ground
+    assert fps == 12.5  # of the mp4
+    with Image.open(file.with_name("1.gif")) as picture:
+        durations = [(picture.seek(i), picture.info["duration"])[1] for i in range(picture.n_frames)]
+    assert durations == [30, 20, 30]  # [ms]: a gif counts hundredths of seconds
 
 
 def test_recorded_worlds(make_task):
