@@ -16,7 +16,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -58,9 +58,8 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--chirp", type=float, nargs="?", const=40.0, metavar="SECONDS", help=hint)
     parser.add_argument("--log", type=Path, help="new MCAP file for every tick; replay.py reads it")
     args = parser.parse_args()
-    cli.check_args(args, chirp=Annotated[float, Limits(10, 120)])
     cli.check_args(args, rate=Rate, seconds=Positive, command=list[float], domain=Annotated[int, Limits(0, 232)])
-    cli.check_args(args, power=Annotated[int, Limits(1, 10)])
+    cli.check_args(args, power=Annotated[int, Limits(1, 10)], chirp=Annotated[float, Limits(10, 120)])
     if args.power and args.interface != "sdk":
         raise UserError("--power is for --interface sdk: it limits unitree_legged_sdk's motors")
     if args.domain is not None and (args.interface in ("sim", "sdk") or ".py:" in args.interface):
@@ -95,34 +94,36 @@ def main() -> None:
     session = Session(controller, transport, log)
     loop = RealTimeLoop(args.rate, session.tick)
     view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
-    ended, aside = threading.Event(), ThreadPoolExecutor()
+    ended, aside, identity = threading.Event(), ThreadPoolExecutor(), [0] * 4  # of those that do not tell theirs
 
-    def tell() -> None:
-        """Write the log and draw the view, in a thread of its own: a disk or a terminal may keep that waiting."""
+    def repeat(act: Callable[[], None]) -> None:
+        """Act again and again, in a thread of its own: a disk or a terminal may keep it waiting, and nothing else."""
         with contextlib.suppress(OSError, AttributeError):  # as other programs, after the loop
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        identity = [0] * 4  # of those that do not tell theirs
         while not ended.wait(POLL):
-            if log:
-                log.write()
-            if controller.state is not None and controller.state.identity.tolist() != identity:
-                identity = controller.state.identity.tolist()
-                said = f"the robot's firmware is {identity[:2]}, its serial number {identity[2:]}"
-                say(partial(print, said, flush=True))
-            say(view.show)
+            act()
+
+    def tell() -> None:
+        """Say which robot it is, once, and draw the view."""
+        if controller.state is not None and controller.state.identity.tolist() != identity:
+            identity[:] = controller.state.identity.tolist()
+            said = f"the robot's firmware is {identity[:2]}, its serial number {identity[2:]}"
+            say(partial(print, said, flush=True))
+        say(view.show)
 
     with StopRequest(lambda text: None) as stop, contextlib.ExitStack() as parts:
         for part in (view.live, *operators, aside, contextlib.closing(session), loop):  # left in the reverse order
             parts.enter_context(part)
         parts.callback(ended.set)
-        telling = aside.submit(tell)
-        while not (stop.requested or time.monotonic() > end or loop.error or telling.done()):
+        repeated = [aside.submit(repeat, act) for act in (tell, *([log.write] if log else []))]
+        while not (stop.requested or time.monotonic() > end or loop.error or any(each.done() for each in repeated)):
             for operator in operators:
                 operator.look()
             if any(each.has_ended for each in (*operators, *([policy] if args.chirp else []))):
                 break
             time.sleep(POLL)
-    telling.result()
+    for each in repeated:
+        each.result()
     said = "\n".join([view.line(), *(f"stopped: {reason}" for reason in session.stops)])
     say(lambda: print(said, flush=True))
     if loop.error is not None:
@@ -155,9 +156,10 @@ def chirp(args: argparse.Namespace, policy: Any) -> Any:
     """Return sweeps in place of a policy, once the operator has said that the robot hangs; with sim it does."""
     from legged_torque.runtime.chirp import Chirp, confirm
 
+    sweeps = Chirp(policy, args.rate, args.chirp)
     if args.interface != "sim":
         confirm()
-    return Chirp(policy, args.rate, args.chirp)
+    return sweeps
 
 
 def connect(args: argparse.Namespace, policy: Any) -> Any:
@@ -186,8 +188,14 @@ def outside(args: argparse.Namespace, trained: str) -> Any:
         kind = getattr(importlib.import_module(importable(Path(file), "--interface FILE.py:CLASS")), name, None)
         if not isinstance(kind, type):
             raise UserError(f"'{file}' has no class '{name}'")
-        transport = kind()
-        if len(getattr(transport, "torque_limits", [])) != len(getattr(transport, "joint_order", [""])):
+        try:
+            transport = kind()
+        except TypeError as error:
+            if error.__traceback__ and error.__traceback__.tb_next:  # a mistake in its own code
+                raise
+            raise UserError(f"'{args.interface}' must be a class that is made without arguments: {error}") from None
+        joints, limits = (getattr(transport, name, None) for name in ("joint_order", "torque_limits"))
+        if not (isinstance(joints, Sized) and isinstance(limits, Sized) and len(joints) == len(limits)):
             raise UserError(f"'{args.interface}' must have joint_order and as many torque_limits")
         return transport
     if args.interface == "sdk":

@@ -16,6 +16,7 @@ from legged_torque.utils import cli
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json, write_whole
+from legged_torque.utils.options import MOTOR_FILES
 from legged_torque.utils.plain_yaml import Dumper
 
 UNITS = ("kg m^2", "N m s/rad", "N m", "rad")
@@ -32,6 +33,8 @@ def parse_args() -> argparse.Namespace:
     if not args.log.is_file():
         raise UserError(f"cannot read '{args.log}': there is no such file")
     args.out = args.out or args.log.with_name(f"{args.log.stem}_motors.yaml")
+    if not str(args.out).endswith(MOTOR_FILES):
+        raise UserError(f"--out must end in {' or '.join(MOTOR_FILES)}, which --motors reads, not '{args.out}'")
     for file in filter(None, (args.out, args.json)):
         cli.check_output(file)
     return args

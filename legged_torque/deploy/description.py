@@ -10,7 +10,8 @@ from typing import Any
 
 import yaml
 
-from legged_torque.utils.errors import UserError, check_names
+from legged_torque.motors.model_config import MODELS
+from legged_torque.utils.errors import UserError, check_names, refuse
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import Dumper, parse_yaml
 from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names
@@ -171,6 +172,18 @@ def holds_gains(description: dict[str, Any]) -> bool:
     """
     timing, terms = description["timing"], [term["name"] for term in description["actions"]["terms"]]
     return "position_residual" in terms and timing["decimation"] > 1 and not timing["refresh_torques"]
+
+
+def laws_of_motors(description: dict[str, Any]) -> list[str]:
+    """Return what motors add to the control law beyond gains of a ``drive``: all that a robot's drives take."""
+    models = {model for model, cfg in MODELS.items() if cfg._of_law and model != "drive"}
+    motors = description.get("motors", {}).items()
+    return [f"the law of the motors' {name}" for name, motor in motors if motor.get("model") in models]
+
+
+def refuse_laws(description: dict[str, Any]) -> None:
+    """Raise a UserError that lists :func:`laws_of_motors`, which no robot has: it would get other torques."""
+    refuse(laws_of_motors(description), "a robot's drives take the gains of a motor 'drive' alone, not")
 
 
 def not_understood(description: dict[str, Any], observations: Container[str], actions: Container[str]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_torque.deploy.description import SCHEMA, from_metadata, metadata, open_network, read
+from legged_torque.deploy.description import SCHEMA, from_metadata, metadata, open_network, read, refuse_laws
 from legged_torque.motors.twin import constants, without_function
 from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, refuse
@@ -144,7 +144,9 @@ class Policy:
 
         Joint positions [rad] and velocities [rad/s] are the present ones. Shapes: (joints,). Models of motors in
         ``policy.yaml`` are left out, since a robot has them, but for gains of a ``drive``, see :meth:`drive_targets`.
+        A UserError names others of the control law.
         """
+        refuse_laws(self.description)
         stiffness, damping = self._drive_gains
         wanted = self.wanted_torques(actions, joint_positions, joint_velocities)
         if np.any(stiffness) or np.any(damping):  # a torque policy without a drive needs no measurements
@@ -168,7 +170,9 @@ class Policy:
         """Return tau, q, kp and kd of drives that make tau + kp (q - position) - kd velocity. Shapes: (joints,).
 
         That is :meth:`wanted_torques`, for position_residual and torque, and a ``drive`` of ``policy.yaml``.
+        A UserError names other motors of the control law.
         """
+        refuse_laws(self.description)
         q = self.nominal_pose.astype(float)
         tau, kp, kd = np.zeros((3, len(q)))
         for term, values in zip(self._action_terms, actions.reshape(-1, len(q)), strict=True):

@@ -52,7 +52,7 @@ def fault(state: RobotState, age: float, received: Received, joints: Joints, bra
     if received.problems:
         return received.problems[0]
     parts = (state.quaternion, state.angular_velocity, state.joint_positions, state.joint_velocities)
-    if not all(np.isfinite(part).all() for part in parts):
+    if not all(np.isfinite(part).all() for part in (*parts, state.temperatures, state.errors)):
         return "a measurement is not finite"
     if abs((length := float(np.linalg.norm(state.quaternion))) - 1.0) > MAX_LENGTH_ERROR:
         return f"the trunk's orientation is a quaternion of length {length:.2g}, not 1"

@@ -12,6 +12,7 @@ SWEEPS = (0.8, 0.2)  # shares of the time: the second one is for what identify.p
 LARGEST = 0.25  # [rad] amplitude
 ROOM, SPEED, TORQUE = 0.5, 0.25, 0.5  # most of the room to the next end of a range, and of largest speed and torque
 RAMP = 0.5  # [s] at both ends of a sweep
+PER_TURN = 10  # commands in a period of the fastest part, at least: with fewer, targets jump
 APART = 2.4  # [rad] phase from joint to joint: the golden angle
 ANSWER = "it hangs"
 CHECKSUM = "chirp"  # that logs have in place of a network's
@@ -30,7 +31,9 @@ class Chirp(Policy):
     has_ended = False
 
     def __init__(self, policy: Policy, rate: float, seconds: float) -> None:
-        """Take the robot and the gains of a policy, for so many ticks a second; a UserError if it has no gains."""
+        """Take the robot and the gains of a policy, for so many ticks a second; a UserError for too few or no gains."""
+        if rate < (least := PER_TURN * FREQUENCIES[1]):
+            raise UserError(f"--rate must be at least {least:g} for the {FREQUENCIES[1]:g} Hz of --chirp, not {rate:g}")
         vars(self).update(vars(policy))
         if not (self.stiffness > 0.0).all():
             raise UserError("--chirp needs a policy with a stiffness above 0 of all joints: its sweeps are positions")

@@ -5,7 +5,7 @@ from enum import Enum
 
 import numpy as np
 
-from legged_torque.deploy.description import holds_gains
+from legged_torque.deploy.description import holds_gains, refuse_laws
 from legged_torque.deploy.policy import Policy, State
 from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, mistake
 from legged_torque.runtime.interface import MotorCommand, PolicyStep, Received, RobotState
@@ -87,6 +87,7 @@ class Controller:
         terms = [term["name"] for term in policy.description["actions"]["terms"]]
         if not {*terms} <= {"position_residual", "torque"}:
             raise UserError(f"a robot's drives know position_residual and torque, not the terms {', '.join(terms)}")
+        refuse_laws(policy.description)
         if holds_gains(policy.description):
             raise UserError("drives do not hold torques of position_residual: train with control.refresh_torques true")
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from legged_torque.deploy.description import NETWORK_FILE, holds_gains, not_understood, read, require
+from legged_torque.deploy.description import NETWORK_FILE, holds_gains, laws_of_motors, not_understood, read, require
 from legged_torque.runtime.interface import JOINT_ORDER
 from legged_torque.utils.errors import refuse
 from legged_torque.utils.plain_yaml import Dumper
@@ -23,7 +23,7 @@ def _read(folder: Path, known_actions: set[str]) -> tuple[dict[str, Any], list[s
     problems = [*description.get("unsupported", []), *not_understood(description, UNITREE, known_actions)]
     motors = description.get("motors", {}).items()
     problems += [f"the gains of the motors' {name}" for name, motor in motors if motor.get("model") == "drive"]
-    problems += ["control.refresh_torques: false"] if holds_gains(description) else []
+    problems += laws_of_motors(description) + (["control.refresh_torques: false"] if holds_gains(description) else [])
     return description, problems
 
 

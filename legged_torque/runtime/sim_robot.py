@@ -124,14 +124,13 @@ class SimRobot:
             self.faults.push = 0.0
         if isinstance(received.newest, MotorCommand):
             self._on_their_way.append((self.data.time + self._latency, received.newest))
-            self._age = 0.0
         zeros = np.zeros(len(self.joint_order))
         damping, had_command = MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING), self._command is not None
         is_dead = np.isin(self.joint_order, self.faults.dead)
         self._drives.begin()
         for _ in range(self._steps):
             while self._on_their_way and self._on_their_way[0][0] <= self.data.time + 1e-9:
-                self._command = self._on_their_way.popleft()[1]
+                self._command, self._age = self._on_their_way.popleft()[1], 0.0
             command = self._command if self._age <= WATCHDOG else None
             self.is_damping = command is None
             pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]

@@ -86,3 +86,13 @@ def test_refused(policy, monkeypatch):
     chirp.confirm()
     monkeypatch.setattr(policy, "stiffness", 0.0 * policy.stiffness)
     assert "stiffness above 0" in error_of(chirp.Chirp, policy, RATE, SECONDS)
+
+
+def test_slow_rates(policy):
+    """At the lowest one, targets move in steps that are small against the motion; lower ones are refused."""
+    for rate in (4.0, 25.0, 99.0):
+        said = f"--rate must be at least 100 for the 10 Hz of --chirp, not {rate:g}"
+        assert error_of(chirp.Chirp, policy, rate, SECONDS) == said
+    sweeps = chirp.Chirp(policy, 100.0, SECONDS)
+    targets = np.array([sweeps.act(sweeps.observation(None, None)) for _ in range(round(SECONDS * 100.0))])
+    assert np.abs(np.diff(targets, axis=0)).max() < 0.1 < 0.4 < np.ptp(targets)

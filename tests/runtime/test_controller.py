@@ -12,7 +12,7 @@ from support.simulated import RATE, Simulated, World, robot_of, standing_at_once
 from legged_torque import resource_path
 from legged_torque.deploy.policy import Policy
 from legged_torque.envs import task_registry
-from legged_torque.runtime.brakes import Brakes, Joints, limited, tilt_of
+from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, tilt_of
 from legged_torque.runtime.chirp import Chirp
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.in_process import InProcess
@@ -140,6 +140,17 @@ def test_tilt():
         assert tilt_of(np.array([np.cos(half), 0.0, 0.0, np.sin(half)])) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_numbers_that_hide_others():
+    """A robot does not walk on if no joint can be said to be the hottest, or to have an error."""
+    state, wide = random_state(np.random.default_rng(0)), np.array([[-99.0] * 12, [99.0] * 12])
+    joints = Joints([f"joint {i}" for i in range(12)], wide, wide, wide[1])
+    assert fault(state, 0.0, Received(), joints, Brakes()) == ""
+    for name in ("temperatures", "errors"):
+        numbers = np.where(np.arange(12) == 3, np.nan, np.where(np.arange(12) == 5, 130.0, 0.0))
+        said = fault(replace(state, **{name: numbers}), 0.0, Received(), joints, Brakes())
+        assert said == "a measurement is not finite"
+
+
 def test_from_lying_to_walking_and_back(policy):
     """A robot stands up into the nominal pose, hands over to the policy only then, and lies down in damping."""
     world = World(policy)
@@ -177,13 +188,18 @@ def test_the_wrong_robot(policy):
             with pytest.raises(UserError, match="export the policy anew"):
                 Controller(wrong, order, RATE)
         policy.description["joints"][order[3]][lacking] = had
-    timing = policy.description["timing"]
+    timing, motors = policy.description["timing"], policy.description["motors"]
     policy.description["timing"] = timing | {"refresh_torques": False}
     with pytest.raises(UserError, match="hold torques of position_residual"):
         Controller(policy, order, RATE)
     policy.description["timing"] |= {"decimation": 1}
     Controller(policy, order, RATE)
     policy.description["timing"] = timing
+    policy.description["motors"] = {"own": {"model": "muscle"}, "ideal": {"model": "ideal"}}
+    for call in (lambda: Controller(policy, order, RATE), lambda: policy.torques(*np.zeros((3, 12)))):
+        with pytest.raises(UserError, match=r"gains of a motor 'drive' alone, not: the law of the motors' own$"):
+            call()
+    policy.description["motors"] = motors
     policy.supplied = ["felt"]
     with pytest.raises(UserError, match="observes felt"):
         Controller(policy, order, RATE)

@@ -21,7 +21,7 @@ from legged_torque.runtime.brakes import Brakes
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
 from legged_torque.runtime.in_process import InProcess
-from legged_torque.runtime.log import RecordedLog
+from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.loop import PRIORITY
 from legged_torque.runtime.session import Session
 from legged_torque.runtime.sim_robot import SimRobot
@@ -126,23 +126,28 @@ def test_only_the_loop_goes_before_other_programs(exported, tmp_path, monkeypatc
     except PermissionError:
         pytest.skip("real-time scheduling is not permitted here")
     seen = set()
-    monkeypatch.setattr(View, "show", lambda self: seen.add(os.sched_getscheduler(0)))
-    assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[0] == 0
-    assert seen == {os.SCHED_OTHER}
+    for kind, name in ((View, "show"), (Log, "write")):
+        monkeypatch.setattr(kind, name, lambda self: seen.add((type(self), os.sched_getscheduler(0))))
+    words = ["--interface=sim", "--seconds=0.1", "--log=log.mcap"]
+    assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
+    assert seen == {(View, os.SCHED_OTHER), (Log, os.SCHED_OTHER)}
 
 
 def test_a_terminal_that_waits(exported, tmp_path):
-    """A robot whose view cannot be written, as after Ctrl-S, is still stopped in time, and its log is whole."""
+    """A robot whose view cannot be written, as after Ctrl-S, is logged and stopped in time; its log is whole."""
     (end, full), log = os.pipe(), tmp_path / "log.mcap"
     os.set_blocking(full, False)
     with contextlib.suppress(BlockingIOError):
         while os.write(full, bytes(4096)):
             pass
     os.set_blocking(full, True)
-    words = [str(exported), "--interface=sim", "--walk", "--seconds=1", f"--log={log}"]
+    words = [str(exported), "--interface=sim", "--walk", f"--log={log}"]
     with subprocess.Popen([sys.executable, str(ROOT / "scripts" / "deploy.py"), *words], stdout=full) as process:
         os.close(full)
         until, last = time.monotonic() + 120.0, b""
+        while not (log.exists() and log.stat().st_size > 200_000) and time.monotonic() < until:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
         while not (last.endswith(b"MCAP0\r\n") and len(last) > 1000) and time.monotonic() < until:
             time.sleep(0.1)
             last = log.read_bytes() if log.exists() else b""
@@ -205,6 +210,17 @@ class Older(Mine):
     def __init__(self):
         super().__init__()
         del self.torque_limits
+
+class Unlimited(Mine):
+    torque_limits = property(lambda self: None, lambda self, limits: None)
+
+class Addressed(Mine):
+    def __init__(self, address):
+        super().__init__()
+
+class Faulty(Mine):
+    def __init__(self):
+        len(None)
 """
 
 
@@ -220,8 +236,12 @@ def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
     (tmp_path / "queue.py").write_text(OWN)
     named, other = "takes a Python file with the name of a module", "there is another module 'queue'"
     wrong = {"own_robot.py:Yours": "no class 'Yours'", "no_robot.py:Mine": named, "queue.py:Mine": other}
-    for given, message in {**wrong, "own_robot.py:Older": "and as many torque_limits"}.items():
+    wrong |= dict.fromkeys(("own_robot.py:Older", "own_robot.py:Unlimited"), "and as many torque_limits")
+    wrong |= {"own_robot.py:Addressed": "made without arguments"}
+    for given, message in wrong.items():
         assert_told_in_one_line(run_here(*own[:2], f"--interface={given}", root=tmp_path), message)
+    with pytest.raises(TypeError):  # a mistake in the class, whose place its author needs
+        run_here(*own[:2], "--interface=own_robot.py:Faulty", root=tmp_path)
     stronger = (resource_path("resources/robots/go2/go2.xml")).read_text("utf-8").replace("45.43", "200")
     (tmp_path / "go2.xml").write_text(stronger)
     export_random(make_task, "go2_torque_multihead", tmp_path / "out", **{"asset.file": str(tmp_path / "go2.xml")})
@@ -262,6 +282,7 @@ def test_scripts(make_task, exported, tmp_path):
         ("deploy.py", ["--interface=sim", "--power=2"], "--power is for --interface sdk"),
         ("deploy.py", ["--interface=sim", "--domain=0"], "--domain is of DDS"),
         ("deploy.py", ["--interface=sim", "--chirp", "--command", "0", "0", "0"], "--command is for policies"),
+        ("deploy.py", ["--interface=lo", "--chirp", "--rate=50"], "at least 100 for the 10 Hz of --chirp, not 50"),
         ("sim_robot.py", ["--motors=rael"], "did you mean 'real'?"),
         ("sim_robot.py", ["--fault=lots=1"], "unknown fault 'lots'; did you mean 'lost'?"),
         ("sim_robot.py", ["--fault=dead=FR_hip"], "did you mean 'FR_hip_joint'?"),
@@ -276,6 +297,7 @@ def test_scripts(make_task, exported, tmp_path):
         (["replay.py", "none.mcap", "--policy=none", "--plot=gap"], "a figure needs a name that ends in .png"),
         (["replay.py", "none.mcap", "--policy=none", "--plot=/dev/null/a.png"], "cannot write '/dev/null/a.png'"),
         (["identify.py", "."], "cannot read '.': there is no such file"),
+        (["identify.py", "log.mcap", "--out=m.txt"], "--out must end in .yaml or .yml"),
     ):
         assert_told_in_one_line(run_here(*words, root=tmp_path), message)
     export_random(make_task, "a1_torque", tmp_path / "a1", **{"control.decimation": 1})  # at 200 Hz

@@ -101,6 +101,7 @@ def test_leapp(make_task, tmp_path, name):
         ("g1_position", write_deploy_yaml, {}, "the joint FL_calf_joint"),
         ("a1_multihead", write_leapp, {"control.refresh_torques": False}, "control.refresh_torques: false"),
         ("go2_torque", write_leapp, {"motors.chain": ["delay", "drive", "ideal"]}, "the gains of the motors' drive"),
+        ("a1_sata", write_leapp, {}, "the law of the motors' muscle"),
         ("a1_multihead_two_rates", write_leapp, {}, "position_phase; an interval of position_residual"),
     ],
 )

@@ -81,6 +81,17 @@ def test_push(changed):
     np.testing.assert_allclose(np.array(apart)[:, 2], 0.0, atol=1e-9)
 
 
+def test_watchdog(changed):
+    """A command acts for 15 ms from its arrival on; once they are over, nothing acts before the next one arrives."""
+    robot, zeros, driven = SimRobot(changed(), JOINT_ORDER, RATE, latency=0.1), np.zeros(12), []
+    for tick in range(160):
+        sent = {0: 3.0, 100: 0.0}  # N m by tick
+        commands = [MotorCommand(zeros + sent[tick], zeros, zeros, zeros, zeros)] if tick in sent else []
+        robot.step(Received(*commands))
+        driven += [] if robot.is_damping else [tick]
+    assert driven == [*range(50, 58), *range(150, 158)]  # of 2 ms
+
+
 def test_torques_beyond_limits_between_two_commands(changed):
     """A command that asks for nothing when it arrives may ask for too much before the next one."""
     robot, zeros = SimRobot(changed(), JOINT_ORDER, RATE), np.zeros(12)

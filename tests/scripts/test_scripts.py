@@ -50,10 +50,21 @@ def test_run_folder(root):
     assert expected.items() <= config.items() and config["env"]["env"]["num_envs"] == 2
 
 
+def test_notes_on_settings_without_effect(tmp_path):
+    """Ranges that nothing is drawn from, and an evaluation that begins after the end."""
+    chain = ["--set=motors.chain=[delay, ideal, lag]", "--set=control.refresh_torques=false"]  # no kernel of its own
+    words = [*SMALL, *chain, "--set=motors.lag.draws={time_constant: {set: [0.001, 0.003]}}", "--logger=none"]
+    told = ("Note: motors.lag.draws needs", "Note: evaluation.also measures nothing", "but there are 16 steps")
+    for more, is_told in (([], True), (["--perturbation=low", "--set=evaluation.also_from=16"], False)):
+        status, output, _ = run_here("train.py", *words, "--set=evaluation.also=[high]", *more, root=tmp_path)
+        assert status == 0 and [note in output for note in told] == [is_told] * 3
+        assert len(list(tmp_path.glob("logs/*/*/evaluations_high.csv"))) == (not is_told)
+
+
 def test_resume_in_a_folder_by_its_path(root, tmp_path):
     """``--load_run`` takes a path, ``--checkpoint`` an earlier one; the run goes on to the iterations of its start."""
     (run,) = (root / "logs" / "a1_position").glob("*_good")
-    words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--logger=none", "--seed=9"]
+    words = [f"--load_run={run}", "--checkpoint=1", "--resume", "--logger=none", "--seed=1"]
     status, output, error = run_here("train.py", "--task=a1_position", "--device=cpu", *words, root=tmp_path)
     assert (status, error) == (0, "")
     assert f"Resuming from {run / 'model_1.pt'}, after 1 iteration.\n" in output
@@ -63,7 +74,7 @@ def test_resume_in_a_folder_by_its_path(root, tmp_path):
     state = torch.load(new / "model_2.pt", weights_only=True)
     assert (state["iter"], state["infos"]["total_timesteps"]) == (2, 2 * 2 * 4)
     train = yaml.safe_load((new / "config.yaml").read_text())["train"]
-    assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (9, "none", 4)
+    assert (train["seed"], train["runner"]["logger"], train["runner"]["num_steps_per_env"]) == (1, "none", 4)
 
 
 def test_resume_with_other_worlds_or_more_steps(tmp_path):
