@@ -5,6 +5,7 @@ by --task_file. In a clone, without --out, they go to resources/robots/NAME and 
 script finds them. Prints what was changed and why, and whether the robot stands.
 """
 
+import importlib.util
 import io
 import shlex
 from pathlib import Path
@@ -54,11 +55,16 @@ def main() -> None:
     code_file = (clone / "legged_torque" / "envs" / "robots" if is_inside else folder) / f"{robot.name}.py"
     for file in (model_file, code_file):
         cli.check_output(file)
+        if file.exists() and file.samefile(args.file):
+            raise UserError(f"'{file}' is the file to import; --name and --out write elsewhere")
         if file.exists() and not args.force:
             raise UserError(f"'{file}' exists; --force writes over it, --name and --out write elsewhere")
     taken = [task for task in task_registry.names() if task.startswith(f"{robot.name}_")]
     if taken and not (is_inside and code_file.exists()):
         raise UserError(f"tasks of a robot '{robot.name}' may get names that are taken, as '{taken[0]}'; see --name")
+    module = None if is_inside else importlib.util.find_spec(robot.name)
+    if module and module.origin and Path(module.origin).resolve() != code_file.resolve():
+        raise UserError(f"'{code_file}' could not be imported: there is another module '{robot.name}'; see --name")
     path = f"resources/robots/{robot.name}/{robot.name}.xml" if is_inside else ""
     text, model = mjcf(robot)
     problems: list[str] = []

@@ -57,6 +57,16 @@ def pitch_axis(axes: np.ndarray) -> np.ndarray:
     return axis if axis[1] >= 0 else -axis
 
 
+def free_joints(model: mujoco.MjModel, legs: list[Leg]) -> set[int]:
+    """Return the joints that legs bend to walk, counted from 0: all about their pitch axes, and those below."""
+    data, free = zero_pose(model), set[int]()
+    for leg in legs:
+        joints = model.body_jntadr[leg.bodies]
+        pitch = joints[np.abs(data.xaxis[joints] @ pitch_axis(data.xaxis[joints])) > PARALLEL]
+        free |= {*(pitch - 1).tolist(), *(joints[list(joints).index(pitch[-1]) :] - 1).tolist()}
+    return free
+
+
 def lowest_point(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
     """Return the center of a shape in the world, at the height of its lowest point [m]. Shape: (3,)."""
     ends = shape.ends() @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
@@ -179,7 +189,8 @@ def _leg_names(source: Source, chains: list[list[int]], data: mujoco.MjData) -> 
 def joint_names(source: Source, legs: list[Leg], mirrored: list[list[str]]) -> list[str]:
     """Return the names of all joints in the order of the file, beginning with those of their legs.
 
-    Where the rest of a name differs between left and right, joints are numbered. Adds a note.
+    Joints are numbered where the rest of a name differs between left and right, and where a part of a name could not
+    say which joints two legs hold. Adds a note.
     """
     model, names = source.model, source.joints
     own = {leg.name: [int(model.body_jntadr[body]) - 1 for body in leg.bodies] for leg in legs}
@@ -187,8 +198,11 @@ def joint_names(source: Source, legs: list[Leg], mirrored: list[list[str]]) -> l
         for joint in joints:
             names[joint] = names[joint] if names[joint].startswith(leg) else f"{leg}_{names[joint]}"
     kinds = {leg: [names[joint].removeprefix(leg) for joint in joints] for leg, joints in own.items()}
-    if any(kinds[right] != kinds[left] for right, left in mirrored):
-        source.notes.append("joints are numbered along their legs: their names differ between left and right")
+    free = free_joints(model, legs) if len(legs) == 2 else set[int]()
+    is_part = any(name in names[joint] for place, name in enumerate(names) if place not in free for joint in free)
+    if is_part or any(kinds[right] != kinds[left] for right, left in mirrored):
+        reason = "the name of one is part of another's" if is_part else "their names differ between left and right"
+        source.notes.append(f"joints are numbered along their legs: {reason}")
         for leg, joints in own.items():
             for place, joint in enumerate(joints, 1):
                 names[joint] = f"{leg}_joint{place}"

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.importer.legs import FOOT, PARALLEL, TRUNK, pitch_axis, zero_pose
+from legged_torque.importer.legs import FOOT, TRUNK, free_joints
 from legged_torque.importer.robot import Robot
 
 WEIGHT_TIMES_HEIGHT = 37.0  # of an A1 with its trunk at 0.303 m [N m]
@@ -106,8 +106,8 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
         speed=f"{robot.speed:.4g}" if "." in f"{robot.speed:.4g}" else f"{robot.speed:.1f}",
         drop=round(stance.drop, 2),
         angles=_literal(dict(zip(robot.joints, (stance.angles.round(3) + 0.0).tolist(), strict=True))),
-        stiffness=_table(robot.by_kind(stance.stiffness)),
-        damping=_table(robot.by_kind(stance.damping)),
+        stiffness=_table(robot, stance.stiffness),
+        damping=_table(robot, stance.damping),
         torque_scale=float(f"{TORQUE_SCALE * stance.load * relative:.2g}"),
         height=round(stance.height, 3),
         torques=LeggedRobotCfg.rewards.scales.torques * (WEIGHT_TIMES_HEIGHT / leverage) ** 2,
@@ -135,14 +135,11 @@ def _penalized(robot: Robot) -> list[str]:
 
 
 def _held(robot: Robot) -> list[str]:
-    """Return the kinds of joints that a two-legged robot holds: those that turn its legs inwards, and off its legs."""
-    model, data = robot.source.model, zero_pose(robot.source.model)
-    free = set[int]()
-    for leg in robot.legs:
-        joints = model.body_jntadr[leg.bodies]
-        pitch = joints[np.abs(data.xaxis[joints] @ pitch_axis(data.xaxis[joints])) > PARALLEL]
-        free |= {*pitch, *joints[list(joints).index(pitch[-1]) :]}
-    return list(dict.fromkeys(kind for joint, kind in enumerate(robot.kinds, 1) if joint not in free))
+    """Return the kinds of joints that a two-legged robot holds; their names where kinds match those that it bends."""
+    free = free_joints(robot.source.model, robot.legs)
+    names, kinds = ([name for i, name in enumerate(found) if i not in free] for found in (robot.joints, robot.kinds))
+    matches_free = any(kind in robot.joints[joint] for kind in kinds for joint in free)
+    return list(dict.fromkeys(names if matches_free else kinds))
 
 
 def _literal(value: str | list | dict) -> str:
@@ -151,8 +148,15 @@ def _literal(value: str | list | dict) -> str:
     return line if len(line) < LINE else json.dumps(value, ensure_ascii=False, indent=4).replace("\n", "\n" + 8 * " ")
 
 
-def _table(numbers: dict[str, float]) -> str:
-    """Return numbers by the kinds of joints as a dictionary; one number if they are all the same."""
-    ordered = sorted(numbers, key=len, reverse=True)  # the first part that matches counts
+def _table(robot: Robot, values: np.ndarray) -> str:
+    """Return numbers by the kinds of joints as a dictionary; one number if they are all the same.
+
+    They are by the names of joints where those of legs have kinds in them, as leg1_2 has 1.
+    """
+    numbers = robot.by_kind(values)
+    parts = sorted(zip(numbers, numbers, strict=True), key=lambda part: len(part[0]), reverse=True)
+    joints = list(zip(robot.joints, robot.kinds, strict=True))
+    if any(next(part for part, _ in parts if part in name) != kind for name, kind in joints):
+        parts = sorted(joints, key=lambda part: len(part[0]), reverse=True)  # the first part that matches counts
     same = len(set(numbers.values())) == 1
-    return str(numbers[ordered[0]]) if same else _literal({kind: numbers[kind] for kind in ordered})
+    return str(numbers[parts[0][1]]) if same else _literal({part: numbers[kind] for part, kind in parts})

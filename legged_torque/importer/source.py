@@ -80,11 +80,7 @@ def read_source(file: Path) -> Source:
             root = ET.parse(file).getroot()
             if any("xacro" in part.tag for part in root.iter()):  # MuJoCo would read the rest and nothing else
                 raise UserError(f"{what}: it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
-            for link in root.findall("link"):  # of a URDF; shapes follow from its collision geoms
-                for part in link.findall("visual"):
-                    link.remove(part)
-            for part in root.findall("material"):
-                root.remove(part)
+            _prepare_urdf(root, what)
             is_urdf = root.tag == "robot"
             text = ET.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(file))
@@ -92,6 +88,8 @@ def read_source(file: Path) -> Source:
             odd = ", ".join(repr(name) for name in names if not NAME.fullmatch(name))
             if odd:
                 raise UserError(f"{what}: names may have letters, digits and _ . : / -, not {odd}")
+            negative = [body for body in spec.bodies if body.mass < 0.0]
+            refuse([f"'{body.name}' must weigh 0 kg or more, not {body.mass:g}" for body in negative], what)
             notes = _prepare(spec, file, is_urdf)
             model = _compile(spec, notes)
             speeds = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]  # of a URDF
@@ -100,10 +98,12 @@ def read_source(file: Path) -> Source:
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
     several = [model.body(b).name for b in range(1, model.nbody) if model.body_jntnum[b] > 1]
+    fixed = [model.body(b).name for b in range(2, model.nbody) if not model.body_jntnum[b]]
     rules = {
         "its trunk does not float": model.njnt < 2 or model.jnt_type[0] != free,
         f"only hinge joints can be imported, not {', '.join(others)}": others,
         f"a body may have one joint, {', '.join(several)} have more": several,
+        f"a body without joints that something refers to cannot be imported: {', '.join(fixed)}": fixed,
         f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
         f"its {model.ntendon} tendons cannot be imported": model.ntendon,
         f"it weighs {model.body_mass.sum():g} kg, at most {HEAVIEST:g} make sense": model.body_mass.sum() > HEAVIEST,
@@ -121,11 +121,27 @@ def read_source(file: Path) -> Source:
     return Source(file, model, sites, poses, limits, [speed for speed in speeds if speed > 0], notes)
 
 
+def _prepare_urdf(root: ET.Element, what: str) -> None:
+    """Remove what MuJoCo need not read of a URDF, and give joints with one limit the other, 0."""
+    for link in root.findall("link"):  # shapes follow from its collision geoms
+        for part in link.findall("visual"):
+            link.remove(part)
+    for part in root.findall("material"):
+        root.remove(part)
+    for joint in root.findall("joint[@type='revolute']"):
+        for limit in joint.findall("limit[@lower]") or joint.findall("limit[@upper]"):
+            low, high = limit.attrib.setdefault("lower", "0"), limit.attrib.setdefault("upper", "0")
+            if float(low) > float(high):
+                raise UserError(f"{what}: the range of '{joint.get('name')}' must be in order, not {low} to {high}")
+
+
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     """Make a file compile to one floating robot without anything else; return notes on the changes."""
     notes = _find_meshes(spec, file, is_urdf)
     in_pairs = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     for part in [*spec.sensors, *spec.lights, *spec.cameras, *spec.sites, *spec.excludes, *spec.pairs]:
+        spec.delete(part)
+    for part in [*spec.skins, *spec.tuples]:
         spec.delete(part)
     switched_on = dict[str, None]()
     for geom in spec.geoms:
@@ -138,7 +154,9 @@ def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
     for part in [*spec.materials, *spec.textures]:
         spec.delete(part)
     _keep_robot(spec, file, is_urdf, notes)
+    notes += ["left out: the compensation of gravity"] if any(body.gravcomp for body in spec.bodies) else []
     for body in spec.bodies:
+        body.gravcomp = 0.0  # else a fixed link stays a body of its own
         if body.name and not body.joints and body.name != "world":
             body.add_site(name=SITE + body.name)
     unnamed = [joint for joint in spec.joints if not joint.name and joint.type != mujoco.mjtJoint.mjJNT_FREE]
@@ -245,7 +263,7 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
             mesh.file = str(found)
         else:
             missing[mesh.name] = mesh
-    spec.meshdir = ""
+    spec.meshdir, spec.strippath = "", False
     weighs = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     for geom in [geom for geom in spec.geoms if geom.meshname in missing]:
         if not is_urdf and (weighs or not geom.parent.explicitinertial):
@@ -271,13 +289,19 @@ def _torque_limits(model: mujoco.MjModel, notes: Notes) -> np.ndarray:
     for actuator in range(model.nu):
         if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
             raise UserError(f"the actuator '{model.actuator(actuator).name}' does not act on a joint")
-    is_servo = model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE
+    is_off = (1 << model.actuator_group.astype(np.int64)) & model.opt.disableactuator != 0
+    off = dict.fromkeys(model.joint(joint).name for joint in model.actuator_trnid[is_off, 0])
+    notes.on(off, "actuators of groups that the file disables are left out")
+    rates = model.actuator_dyntype == mujoco.mjtDyn.mjDYN_INTEGRATOR  # whose activations, not controls, are torques
+    model.actuator_ctrlrange[rates] = model.actuator_actrange[rates]
+    model.actuator_ctrllimited[rates] = model.actuator_actlimited[rates]
+    is_servo = ~is_off & (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE)
     model.actuator_ctrllimited[is_servo] = False  # their controls are not torques
     if is_servo.any():
         notes.append(f"{is_servo.sum()} position or velocity servos became motors; their gains are left out")
     limits, bare, uneven = [], list[str](), list[str]()
     for joint in range(1, model.njnt):
-        motors, name = motors_of(model, joint), model.joint(joint).name
+        motors, name = [motor for motor in motors_of(model, joint) if not is_off[motor]], model.joint(joint).name
         low, high = np.sum([torque_range(model, motor) for motor in motors], axis=0) if motors else (-np.inf, np.inf)
         own = model.jnt_actfrcrange[joint] if model.jnt_actfrclimited[joint] else (-np.inf, np.inf)
         down, up = min(-low, -own[0]), min(high, own[1])
@@ -309,6 +333,5 @@ def _note_left_out(model: mujoco.MjModel, notes: Notes) -> None:
         "density, viscosity and wind": (model.opt.density, model.opt.viscosity, model.opt.wind),
         "the dynamics of actuators (filters, activations)": [model.actuator_dyntype],
         "the delays of actuators": [getattr(model, "actuator_delay", 0.0)],
-        "the compensation of gravity": [model.body_gravcomp],
     }
     notes += [f"left out: {what}" for what, values in found.items() if any(np.any(value) for value in values)]

@@ -188,8 +188,8 @@ def drawing_notes(spec: mujoco.MjSpec) -> Iterator[str]:
 def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     """Return the pairs of geoms that may touch, as MuJoCo filters them. Shape: (pairs, 2).
 
-    Their ``contype`` and ``conaffinity`` match, and their bodies are neither the same, nor parent and child, nor
-    excluded; or they are a ``<pair>``. None if the model disables contacts.
+    Their ``contype`` and ``conaffinity`` match, and their bodies are neither the same, nor parent and child (if
+    the model filters these), nor excluded; or they are a ``<pair>``. None if the model disables contacts.
     """
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONTACT:
         return np.empty((0, 2), int)
@@ -197,7 +197,9 @@ def colliding_pairs(model: mujoco.MjModel) -> np.ndarray:
     bodies = model.geom_bodyid[[first, second]]
     welds = model.body_weldid[bodies]  # bodies without joints are parts of their parents
     parents = model.body_weldid[model.body_parentid[welds]]
-    family = (welds[0] == welds[1]) | ((welds > 0).all(axis=0) & (welds == parents[::-1]).any(axis=0))
+    filters = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    related = filters & (welds > 0).all(axis=0) & (welds == parents[::-1]).any(axis=0)
+    family = (welds[0] == welds[1]) | related
     excluded = np.isin((bodies[0] << 16) + bodies[1], model.exclude_signature)
     types, affinities = model.geom_contype, model.geom_conaffinity
     meet = (types[first] & affinities[second]) | (types[second] & affinities[first])

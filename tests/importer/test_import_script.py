@@ -68,6 +68,11 @@ def test_script(tmp_path, monkeypatch):
     monkeypatch.setattr(task_registry, "_tasks", before)
     assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
     assert_told_in_one_line(run("--out", "new"), "exists")
+    assert_told_in_one_line(run("--name", "random"), "there is another module 'random'; see --name")
+    (tmp_path / "own.xml").write_text(as_mjcf(""))
+    own = run_here("import_robot.py", "own.xml", "--force", root=tmp_path)
+    assert_told_in_one_line(own, "'own.xml' is the file to import; --name and --out write elsewhere")
+    assert (tmp_path / "own.xml").read_text() == as_mjcf("") and not list(tmp_path.glob("random.*"))
     assert_told_in_one_line(run("--name", "go2_torque"), "names that are taken, as 'go2_torque_gravity'")
     assert run("--name", "cat")[0] == 0
     assert sorted(path.name for path in tmp_path.glob("cat.*")) == ["cat.py", "cat.xml"]  # outside of a clone

@@ -10,6 +10,7 @@ import torch
 import yaml
 from support.published import as_menagerie, as_mjcf, urdf
 
+from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
 from legged_torque.envs.base.held_pose import standing_note
@@ -20,6 +21,7 @@ from legged_torque.importer.robot import import_robot
 from legged_torque.importer.settings import settings
 from legged_torque.motors.config import by_joint
 from legged_torque.sim.fused.tree import read_tree
+from legged_torque.sim.model import indices_matching
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.standing import hold_pose
 
@@ -160,6 +162,76 @@ def test_rotors_of_motors(written):
         mujoco.mj_mulM(each, data, row, np.eye(14)[7])
         seen.append([row[7], data.qfrc_passive[7]])
     assert seen[1] == pytest.approx(seen[0]) and model.actuator("FL_calf").ctrlrange[1] == 18 + 6
+
+
+SECOND = f'{MOTOR}<motor joint="FL_calf" group="1" ctrlrange="-50 50" ctrllimited="true"/>'
+RATE = 'dyntype="integrator" ctrllimited="true" ctrlrange="-1 1" actlimited="true" actrange="-5 5"'
+MOTORS = {
+    "another group": ('<option actuatorgroupdisable="2"/>', SECOND, 68, ""),
+    "disabled group": ('<option actuatorgroupdisable="1 30"/>', SECOND, 18, "disables are left out: FL_calf"),
+    "integrator": ("", f'<general joint="FL_calf" gear="3" gainprm="2" {RATE}/>', 30, "left out: the dynamics"),
+}
+
+
+@pytest.mark.parametrize("kind", MOTORS)
+def test_limits_of_unusual_motors(written, kind):
+    """Motors that the file disables add nothing, and the torque of an integrator is bounded by its activation."""
+    option, motors, limit, note = MOTORS[kind]
+    robot, model, _ = written(as_mjcf(option).replace(MOTOR, motors), "xml")
+    assert model.actuator("FL_calf").ctrlrange.tolist() == [-limit, limit]
+    assert any(note in other for other in robot.source.notes), robot.source.notes
+
+
+@pytest.mark.parametrize(("given", "expected"), [('lower="-0.8"', [-0.8, 0.0]), ('upper="0.8"', [0.0, 0.8])])
+def test_one_limit(written, given, expected):
+    """The limit that a URDF does not say is 0."""
+    _, model, _ = written(urdf().replace('lower="-0.8" upper="0.8"', given), "urdf")
+    assert model.joint("LF_HAA").range.tolist() == expected
+
+
+def test_meshes_whose_paths_are_stripped(written, tmp_path):
+    """A mesh is found in its folder although strippath is for the folder to be left out."""
+    block, folder = "v 0 0 0|v 1 0 0|v 0 1 0|v 0 0 1|f 1 3 2|f 1 2 4|f 1 4 3|f 2 3 4", tmp_path / "parts"
+    folder.mkdir()
+    (folder / "block.obj").write_text(block.replace("|", "\n"))
+    mesh = '<compiler strippath="true"/><asset><mesh file="parts/block.obj" scale="0.1 0.1 0.1"/></asset>'
+    source = as_mjcf(mesh).replace("<freejoint/>", '<freejoint/><geom type="mesh" mesh="block" mass="1"/>')
+    _, model, _ = written(source, "xml")
+    assert model.body_mass.sum() == pytest.approx(5 + 4 * 0.85 + 1)
+
+
+NUMBERED = [("thigh", "1"), ("calf", "2"), ("FL_", "leg1_"), ("FR_", "leg2_"), ("RL_", "leg3_"), ("RR_", "leg4_")]
+
+
+def test_gains_of_numbered_joints(written):
+    """Each joint has the gains of its kind, although names of legs have those of kinds in them."""
+    source = as_mjcf("").replace('range="-2.6', 'armature="1e-4" range="-2.6')  # light calves bear less damping
+    for words in NUMBERED:
+        source = source.replace(*words)
+    robot, _, cfg = written(source, "xml")
+    assert robot.joints[:3] == ["leg1_1", "leg1_2", "leg2_1"]
+    damping = np.reshape(by_joint("damping", cfg.control.damping, robot.joints), (4, 2))
+    assert (damping == damping[0]).all() and damping[0, 0] != damping[0, 1]
+
+
+G1 = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+NAMES = {
+    "left_hip_roll_joint": ("left_{}", "right_{}", [f"{part}_joint" for part in G1]),
+    "leg1_2": ("leg1_{}", "leg2_{}", range(1, 7)),
+    "left_joint2": ("left_{}", "right_{}", ["hip3", "hip2", "hip", "knee", "ankle2", "ankle"]),
+}
+
+
+@pytest.mark.parametrize("second", NAMES)
+def test_held_joints(written, second):
+    """Those of two legs are hip roll and yaw, also where names of others have theirs in them."""
+    source, (left, right, names) = (RESOURCES_DIR / "robots" / "g1" / "g1.xml").read_text(), NAMES[second]
+    for part, name in zip(G1, names, strict=True):
+        source = source.replace(f'"left_{part}_joint"', f'"{left.format(name)}"')
+        source = source.replace(f'"right_{part}_joint"', f'"{right.format(name)}"')
+    robot, _, cfg = written(source, "xml")
+    assert robot.joints[1] == second
+    assert indices_matching(robot.joints, cfg.rewards.held_joints) == [1, 2, 7, 8]
 
 
 @pytest.mark.parametrize("name", FILES["traps"])

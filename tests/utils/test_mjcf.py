@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import body_chains, hang_up
+from legged_torque.utils.mjcf import body_chains, colliding_pairs, exclude_self_collisions, hang_up
 from legged_torque.utils.standing import hold_pose
 
 
@@ -27,6 +27,20 @@ def test_body_chains(text, chains):
     """There is a chain for each end of the tree, in the file's order; chains share bodies above a branch."""
     model = tree(text)
     assert ["".join(model.body(body).name for body in chain) for chain in body_chains(model)] == chains
+
+
+@pytest.mark.parametrize(("flag", "pairs"), [("enable", [[0, 2]]), ("disable", [[0, 1], [0, 2], [1, 2]])])
+def test_parents_and_children(flag, pairs):
+    """They may touch if the file switches the filter of parents off, until they are excluded; MuJoCo agrees."""
+    ends = "<joint/><geom/></body>"
+    body = f"<body><freejoint/><geom/><body>{ends[:-7]}<body>{ends}</body></body>"
+    option = f'<option><flag filterparent="{flag}"/></option><default><geom size="0.1"/></default>'
+    spec = mujoco.MjSpec.from_string(f"<mujoco>{option}<worldbody>{body}</worldbody></mujoco>")
+    for expected in (pairs, []):
+        data = mujoco.MjData(spec.compile())
+        mujoco.mj_forward(data.model, data)
+        assert colliding_pairs(data.model).tolist() == expected == sorted(data.contact.geom.tolist())
+        exclude_self_collisions(spec, data.model)
 
 
 def test_a_robot_that_hangs():
