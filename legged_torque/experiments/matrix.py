@@ -13,6 +13,7 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.limits import Count, check_value, types_of
 from legged_torque.utils.options import Options, draw_only
@@ -26,8 +27,9 @@ from legged_torque.utils.runs import (
 )
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
-CELL_SETTINGS = ("seed", "runner.experiment_name", "env.num_actions", "evaluation.perturbation", "evaluation.also")
-"""Settings that ``train`` must not change, since they follow from tasks, environments and seeds."""
+CELL_SETTINGS: tuple[str, ...] = ("seed", "runner.experiment_name", "env.num_actions")
+CELL_SETTINGS += ("evaluation.perturbation", "evaluation.also", "evaluation.at_end")
+"""Settings that ``train`` must not change, since the experiment sets them."""
 EVALUATION: dict[str, Any] = {"num_envs": 256, "num_steps": 2000}
 """Worlds and control steps of an evaluation, by default."""
 GROUNDS: dict[str, Any] = {"kinds": ["all"], "levels": [level / 10 for level in range(10)], "num_envs": 40}
@@ -158,10 +160,13 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
     task_registry.import_files(task_files)
     matrix = replace(read_plan(file), task_files=tuple(str(Path(name).resolve()) for name in task_files))
     for key in CELL_SETTINGS:
-        if key in matrix.train:
-            raise UserError(f"train.{key} cannot be set: it comes from tasks, environments and seeds")
+        if key in flat(matrix.train):
+            raise UserError(f"train.{key} cannot be set: the experiment sets it")
     named_kinds(matrix.grounds.get("kinds", []))
     rising_levels(matrix.grounds.get("levels", []))
+    for evaluation, settings in matrix.changed().items():
+        if "env.num_envs" in flat(settings):
+            raise UserError(f"env.num_envs of {evaluation} cannot be set: it is evaluation.num_envs")
     of_tasks = {}
     for cell in matrix.cells(Path()):
         words, options = set_words(matrix.train), Options(device="cpu", seed=cell.seed, perturbation=cell.environment)
@@ -178,6 +183,8 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
             check_env_cfg(changed := task_registry.get_new_cfgs(options)[0])
             if evaluation.startswith(SWEEP):
                 draw_only(changed, evaluation.removeprefix(SWEEP))
+            if to_dict(changed.asset) != to_dict(env_cfg.asset):
+                load_asset(changed)
         of_tasks[cell.task] = env_cfg
     for env_cfg in of_tasks.values():
         load_asset(env_cfg)

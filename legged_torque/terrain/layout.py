@@ -119,10 +119,10 @@ class Layout:
         Shape: (num_rows, num_cols, 3), float32.
         """
         result = np.empty((self.num_rows, self.num_cols, 3), np.float32)
-        reach, middle = round(0.5 * START_SIZE / self.horizontal_scale), self._border + self._tile // 2
+        reach, middle = 0.5 * START_SIZE / self.horizontal_scale, self._border + 0.5 * self._tile
+        start = slice(math.floor(middle - reach), math.ceil(middle + reach) + 1)  # of the first tile
         for row, col in np.ndindex(self.num_rows, self.num_cols):
-            x, y = middle + row * self._tile, middle + col * self._tile
-            highest = heights[x - reach : x + reach + 1, y - reach : y + reach + 1].max()
+            highest = heights[row * self._tile :, col * self._tile :][start, start].max()
             result[row, col] = (row - 0.5 * self.num_rows + 0.5), (col - 0.5 * self.num_cols + 0.5), highest
         result[..., :2] *= self.tile_size
         return result

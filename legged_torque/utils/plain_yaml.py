@@ -47,6 +47,16 @@ class Loader(yaml.SafeLoader):
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
         """Leave merge keys, ``!!merge``, unread: merges of merges grow without bounds while the text is loaded."""
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the values of a mapping; a YAMLError if a key stands in it twice, of which YAML keeps the last one."""
+        values = super().construct_mapping(node, deep)
+        if len(values) < len(node.value):
+            for key_node, _ in node.value:
+                if (key := self.construct_object(key_node, deep=True)) not in values:
+                    raise yaml.YAMLError(f"line {key_node.start_mark.line + 1} has the key {key!r} a second time")
+                del values[key]
+        return values
+
 
 class Dumper(yaml.SafeDumper):
     """Writes YAML for :class:`Loader`: text that looks like one of its numbers is quoted."""

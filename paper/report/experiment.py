@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from legged_torque.experiments.matrix import CONDITION, ROUGH_GROUND, SETTINGS_FILE, SWEEP, Cell, Matrix, read_plan
-from legged_torque.paper.report.evaluations import COLUMNS, METRIC_NAMES, read_evaluations
+from legged_torque.paper.report.evaluations import COLUMNS, METRIC_NAMES, MILLION, read_evaluations
 from legged_torque.paper.report.unplanned import find_trainings, plan_of, ranges_of
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
 from legged_torque.utils.errors import UserError
@@ -178,7 +178,7 @@ def read_experiment(folder: Path) -> Experiment:
 
 def read_training(cell: Cell, runs: list[Path]) -> Training:
     """Read a training and its runs. Evaluations of a run replace those of earlier ones from its first one on."""
-    training = Training(cell)
+    training, earlier = Training(cell), ""
     for run_dir in runs:
         if (run_dir / CONFIG_FILE).is_file():
             try:
@@ -193,6 +193,12 @@ def read_training(cell: Cell, runs: list[Path]) -> Training:
                 before = training.evaluations.get(name, rows[:0])
                 kept = before[before["steps"] < rows["steps"].iloc[0]]
                 training.evaluations[name] = pd.concat([kept, rows], ignore_index=True)
+                if name == cell.environment:
+                    most, end = before["steps"].max() / MILLION, rows["steps"].iloc[-1] / MILLION
+                    if most > end:
+                        later = f"the later '{run_dir.name}', which ends after {end:.4g}, counts"
+                        training.problems.append(f"'{earlier}' has {most:.4g} million steps, but {later}")
+                    earlier = run_dir.name
     files = [*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]
     files += {cell.result_file(name) for name in (ROUGH_GROUND, *cell.further)}
     for file in sorted(file for file in files if file.is_file()):

@@ -25,7 +25,9 @@ from legged_torque.paper.report.figures_curves import FEW
 from legged_torque.paper.report.robustness import condition_table, find_sweeps, findings, sweep_figures
 from legged_torque.paper.report.style import in_words, method, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
+from legged_torque.paper.report.unplanned import differing
 from legged_torque.paper.values import ENVIRONMENTS, PAPER_TASKS
+from legged_torque.utils.config import flat
 from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import portable_path, without_machine, write_whole
 
@@ -103,7 +105,7 @@ def render(template: str, values: dict[str, Any], filters: dict[str, Any]) -> st
 
 
 def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
-    """Return a line for everything planned that is missing, unfinished or unreadable."""
+    """Return a line for everything planned that is missing, unfinished, unreadable, or of several settings."""
     lines, plan = list(experiment.problems), experiment.plan
     for environment, task in product(plan.environments, plan.tasks):
         where, runs = f"`{task}` in {in_words(environment)}", experiment.runs_of(task, environment)
@@ -114,6 +116,10 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
             lines.append(f"{where}: no data, no training has begun.")
         problems = {run.cell.seed: "; ".join(run_problems(run, from_step)) for run in runs}
         lines += [f"{where}, seed {seed}: {text}." for seed, text in problems.items() if text]
+        configs = [without_machine(config) for run in runs for config in run.configs]
+        settings = [flat(config["env"]) | flat(config["train"]) for config in configs]
+        if changes := sorted({change for each in settings for change in differing(each, settings)}):
+            lines.append(f"{where}: its trainings have different settings: {', '.join(changes)}.")
     if experiment.unplanned:
         lines.append(f"Left out, as experiment.yaml does not name them: {', '.join(experiment.unplanned)}.")
     return lines

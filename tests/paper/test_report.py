@@ -24,8 +24,9 @@ from support.scripts import assert_told_in_one_line
 
 from legged_torque.experiments.times import write_times
 from legged_torque.paper.report.evaluations import METRIC_NAMES
+from legged_torque.paper.report.experiment import read_experiment
 from legged_torque.paper.report.figures_curves import smoothed
-from legged_torque.paper.report.report import fenced, markdown_table, to_html
+from legged_torque.paper.report.report import fenced, markdown_table, missing_lines, to_html
 from legged_torque.paper.report.tables import welch
 
 EVIL = "</code></pre><script>alert(1)</script> <img src=http://evil.example/x.png> & `x` | **y** ![z](/etc/passwd)"
@@ -115,6 +116,18 @@ def test_missing_parts(text):
     assert "- `a1_multihead` in low: no data, no training has begun." in top
     assert "- `a1_torque` in low: no training has begun with seed 2." in top
     assert "not finished, 50 of 110 million steps (45%)" in top and "`a1_position`" not in top
+
+
+def test_seeds_of_several_settings(tmp_path):
+    """If seeds of a task were not trained with the same settings, a line names these; files lie where they may."""
+    write_experiment(tmp_path, {"low": ["low"]}, tasks=("a1_position", "a1_torque"))
+    for (task, seed), scale in zip(product(("a1_position", "a1_torque"), (1, 2)), (4.0, 8.0, 4.0, 4.0), strict=True):
+        env = {"control": {"torque_scale": scale}, "asset": {"file": f"/home/of_{seed}/a1.xml"}}
+        settings = {"env": SETTINGS["env"] | env, "train": SETTINGS["train"] | {"seed": seed}}
+        write_part(tmp_path / f"{task}-low-s{seed}" / "2026-01-01_00-00-00", whole_run(0.5), **settings)
+    (text,) = missing_lines(read_experiment(tmp_path), 0.0)
+    assert text.startswith("`a1_position` in low: ")
+    assert text.endswith(" different settings: control.torque_scale=4.0, control.torque_scale=8.0.")
 
 
 @pytest.mark.parametrize(("tracking", "million"), [(0.02, 110), (0.9, 10)])

@@ -61,7 +61,7 @@ def test_runs_without_a_plan(logs):
     assert experiment.plan.tasks == ["mine", "mine wide", "other"] and experiment.plan.seeds == [1, 2, 7]
     wide = experiment.runs_of("mine wide", "low")[0]
     assert (wide.rows["steps"] / 1e6).tolist() == [10, 60, 80, 90, 100, 110]
-    assert len(experiment.problems) == 1 and "'bad'" in experiment.problems[0]
+    assert not wide.problems and len(experiment.problems) == 1 and "'bad'" in experiment.problems[0]
     single = read_experiment(logs / "other" / "2026-01-07_00-00-00")
     assert [run.cell.task for run in single.runs] == ["other"] and len(single.runs[0].rows) == 5
 
@@ -102,6 +102,16 @@ def test_runs_with_other_settings(tmp_path):
     assert len(first.rows) == len(second.rows) == 5 and len(first.configs) == 2
     (problem,) = experiment.problems  # its two teachers
     assert problem.startswith(f"{names[0]} in low, seed")
+
+
+def test_a_later_run_of_fewer_steps(tmp_path):
+    """It counts, as later ones do, but the longer run is named."""
+    for day, million in enumerate((110, 12), 1):
+        config = settings("mine", 1, "low") | {"max_iterations": million}
+        write_run(tmp_path / f"2026-01-0{day}_00-00-00", [line(million // 2, 0.1), line(million, 0.2)], config)
+    (training,) = read_experiment(tmp_path).runs
+    (problem,) = training.problems
+    assert training.steps == 12e6 and problem.startswith("'2026-01-01_00-00-00' has 110 million steps, ")
 
 
 def test_files_of_one_name(tmp_path):
