@@ -53,9 +53,12 @@ class Sensor(Buffers):
     def update(self, is_new: Tensor) -> None:
         """Measure, where and when it is time, once per control step.
 
-        Where an episode has just started, as ``is_new`` says, nothing from before is left. Shape: (num_envs,), bool.
+        Where an episode has just started, as ``is_new`` says, nothing from before is left. A UserError if the
+        measurement has another shape. Shape: (num_envs,), bool.
         """
         now, new = self.measure(), is_new.view(-1, *[1] * len(self.shape()))
+        if (given := tuple(now.shape)) != (wanted := tuple(self.newest.shape)):
+            raise UserError(f"{type(self).__name__}.measure returns the shape {given}, not {wanted}")
         if self.has_noise and self.cfg.noise:
             now = now + self.cfg.noise * (2.0 * torch.rand_like(now) - 1.0)
         if self.interval > 1:

@@ -14,6 +14,7 @@ from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.sensors.sensing import Sensing
 from legged_torque.sensors.sensor import Sensor
 from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.errors import UserError
 
 
 class Sensors(dict[str, Sensor]):
@@ -34,6 +35,8 @@ class Sensors(dict[str, Sensor]):
         super().__init__({name: section.build(state) for name, section in sections.items()})
         self.height_scan = HeightScan(cfg.terrain, state) if state.ground.map is not None else None
         if self.height_scan:
+            if "height_scan" in self:
+                raise UserError("sensors.height_scan has the name of the height scan of rough ground: give it another")
             self["height_scan"] = self.height_scan
         for sensor in self.values():
             sensor.has_noise = cfg.noise.add_noise

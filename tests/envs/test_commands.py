@@ -109,5 +109,6 @@ def test_a_generator_of_ones_own(tmp_path, make_task, monkeypatch):
     task.command_generator.hold((0.1, 0.2, 0.3))
     step(task)
     torch.testing.assert_close(task.commands, torch.tensor([[0.1, 0.2, 0.3]] * 500))
+    assert "not [0.5]" in error_of(task.command_generator.hold, (0.5,))
     grounds = Grounds.of(["flat"], [0.0])
     assert "commands.build" in error_of(grounds.cfg, task_registry.get_cfgs("square")[0], 1)

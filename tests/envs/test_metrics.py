@@ -256,6 +256,22 @@ def test_breakdown_by_hand(task):
     assert table["lin_vel_x"][0]["error_standard_error"] == pytest.approx(np.sqrt(2 * 0.5**2 * 5 / 4) / 4)
 
 
+def test_robots_that_stand_are_in_no_part(make_task):
+    """Parts of a range without 0 have only those that walk, as shares of all; a fixed command is its own range."""
+    task = make_task("a1_torque", 100, **{"commands.ranges.lin_vel_x": [0.5, 1.0], "commands.standing_share": 0.5})
+    breakdown, commands = CommandBreakdown(task), task.commands.clone()
+    task.step(torch.zeros(100, 12))
+    breakdown.add_step(commands)
+    counted = commands[~task.reset_buf, 0].numpy()
+    parts = np.histogram(counted, np.linspace(0.5, 1.0, 5))[0]
+    assert 0.2 < parts.sum() / len(counted) < 0.8 and parts.all()
+    shares = [part["share"] for part in breakdown.table()["lin_vel_x"]]
+    assert shares == pytest.approx((parts / len(counted)).tolist())
+    fixed = make_task("a1_torque", 2, **{"commands.fixed": [2.0, 0.0, 0.0]})
+    add(fixed, held := CommandBreakdown(fixed), commands=[[2.0, 0.0, 0.0]] * 2)
+    assert [(part["from"], part["to"], part["share"]) for part in held.table()["lin_vel_x"]] == [(2.0, 2.0, 1.0)]
+
+
 def test_measure_uses_the_commands_of_the_step(make_task):
     """A step is compared with the command that held in it, although its end draws a new one; episodes begin anew."""
     task = make_task("a1_position", 3, **{"commands.resampling_probability": 1.0})

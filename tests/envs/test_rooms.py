@@ -50,18 +50,25 @@ def test_robot_without_mirrored_legs(make_task):
 @pytest.mark.parametrize(
     ("term", "message"),
     [
-        (("command", 3, SCALAR), "two observation terms are called 'command'"),
-        (("phase", 2, SCALAR), "observation 'phase' has 2 values, 2 scales and 1 in its mirror image"),
-        (("phase", 2, None, (1.0, 2.0, 3.0)), "observation 'phase' has 2 values, 3 scales and 2 in its mirror image"),
+        (("command", (2, 3), SCALAR), "two observation terms are called 'command'"),
+        (("phase", (2, 2), SCALAR), "observation 'phase' has 2 values, 2 scales and 1 in its mirror image"),
+        (("phase", (2, 2), None, [1, 2, 3]), "observation 'phase' has 2 values, 3 scales and 2 in its mirror image"),
+        (("phase", (2,), SCALAR), "observation 'phase' has the shape (2,), not (2, size)"),
+        (("phase", (1, 2), None), "observation 'phase' has the shape (1, 2), not (2, size)"),
+        (("image", (2, 2, 2), None), "observation 'image' has the shape (2, 2, 2), not (2, size)"),
+        (("own", (2, 2, 2), SCALAR), "observation 'own' has 4 values, 4 scales and 1 in its mirror image"),
+        (("own", (2,), None), "observation 'own' has the shape (2,), not (2, size)"),
     ],
 )
 def test_observation_terms_that_do_not_fit(term, message):
-    """A name twice and another number of scales or mirrored values are refused."""
-    name, size, *rest = term
+    """A name twice, other shapes and another number of scales or mirrored values are refused, also of "own" groups."""
+    name, shape, *rest = term
+    group = "group" if name == "own" else ""
 
     class Robot(LeggedRobot):
         def observation_terms(self):
-            return [*super().observation_terms(), ObservationTerm(name, lambda: torch.zeros(2, size), *rest)]
+            own = ObservationTerm(name, lambda: torch.zeros(shape), *rest, group=group)
+            return [*super().observation_terms(), own]
 
     cfg = A1Cfg()
     cfg.env.num_envs = 2
@@ -76,6 +83,7 @@ def test_observation_terms_that_do_not_fit(term, message):
             "'mass' is the model's 'body_mass'",
         ),
         (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
+        (lambda task: RandomParameter("gravity", task.p_gains, [0], {}), "two random parameters are called 'gravity'"),
         (lambda task: RandomParameter("thigh_mass", "body_mass", [3, 6], {"scale": [0.5, 0.9]}), "'thigh_mass'"),
         (
             lambda task: RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]}),
@@ -84,7 +92,7 @@ def test_observation_terms_that_do_not_fit(term, message):
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
-    """One that changes the model unseen, or whose mirror image is unknown or has another size, is refused by name."""
+    """One that changes the model unseen, has a name twice, or a mirror image that is unknown or of another size."""
 
     class Robot(LeggedRobot):
         def random_parameters(self):

@@ -52,7 +52,6 @@ def test_a_held_command_has_no_heading(make_task):
         task.step(torch.zeros(3, 12))
         torch.testing.assert_close(task.commands, torch.tensor([[0.5, -0.2, 0.3]] * 3))
     task.command_generator.hold(None)
-    task.command_generator.resample(torch.ones(3, dtype=torch.bool))
     task.step(torch.zeros(3, 12))
     assert not (task.commands == torch.tensor([0.5, -0.2, 0.3])).any()
 

@@ -10,11 +10,14 @@ from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 from torch import nn
 
+from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.base.symmetry import with_mirror_images
+from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.learning.ppo.cpu_ppo import CpuPPO
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mirroring import counterparts
+from legged_torque.utils.mirroring import VECTOR, Mirroring, counterparts
 
 TASKS = ["a1_position", "a1_torque", "a1_torque_curriculum", "a1_torque_multihead"]
 GROUPS = ("policy", "critic", "actions")
@@ -73,6 +76,23 @@ def test_both_or_one_of_observations_and_actions(make_task):
     assert nothing is None and torch.equal(only["critic"], both["critic"])
     nothing, only = with_mirror_images(task, None, actions)
     assert nothing is None and torch.equal(only, images)
+
+
+def test_groups_with_more_axes():
+    """Vectors of feet and a table of four numbers in groups of their own are mirrored number by number."""
+
+    class Robot(TorqueRobot):
+        def observation_terms(self):
+            feet, table = self.symmetry.feet.of_vectors(VECTOR), Mirroring((2, 3, 0, 1), (1.0, -1.0, 1.0, -1.0))
+            own = {"feet": (feet, torch.ones(2, 4, 3)), "table": (table, torch.ones(2, 2, 2))}
+            groups = [ObservationTerm(name, lambda v=v: v, mirror, group=name) for name, (mirror, v) in own.items()]
+            return [*super().observation_terms(), *groups]
+
+    cfg = A1TorqueCfg()
+    cfg.env.num_envs = 2
+    mirror, feet = Robot(cfg).mirror, torch.randn(5, 4, 3)
+    assert torch.equal(mirror("feet", feet), feet[:, [1, 0, 3, 2]] * torch.tensor([1.0, -1.0, 1.0]))
+    assert mirror("table", torch.tensor([[[0.0, 1.0], [2.0, 3.0]]])).tolist() == [[[2.0, -3.0], [0.0, -1.0]]]
 
 
 def test_counterparts():

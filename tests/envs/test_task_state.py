@@ -50,6 +50,14 @@ def test_state_dict(make_task):
     assert other.total_steps.item() == 4_321_103
 
 
+def test_a_name_is_kept_once(make_task):
+    """A second tensor under a name would leave the first one out of checkpoints."""
+    task = make_task("a1_torque", 2)
+    phase = task.keep("phase", torch.zeros(2, 1))
+    assert "task.keep has 'phase' twice" in error_of(task.keep, "phase", torch.ones(2, 1))
+    assert task.world_state_dict()["task"]["phase"] is phase
+
+
 def test_air_time_ends_with_a_touch(make_task):
     """The touching step is rewarded for the swing that it ends; then the count starts anew."""
     task = make_task("a1_torque", 1)

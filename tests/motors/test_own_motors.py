@@ -9,6 +9,7 @@ from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.legged_robot import IN_TORCH
+from legged_torque.envs.base.sweep import Sweep
 from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.motors.config import DelayCfg, MotorCfg
 from legged_torque.motors.kernel import read
@@ -245,6 +246,19 @@ def test_mistakes():
     assert "one link that acts on actions at most, not delay, bus" in error_of(make, 1, ("delay", "bus", "curve"))
 
 
+def test_a_delay_of_another_name():
+    """Its range in control steps stays the same in time, is told in its unit, and may be no part of a control step."""
+    cfg = OwnMotorsCfg()
+    cfg.env.num_envs, cfg.motors.chain = 2, ["bus", "curve"]
+    assert "give motors.bus.range" in error_of(lambda: Sweep(TorqueRobot(cfg), "action_delay"))
+    cfg.motors.bus.range, cfg.motors.bus.unit = [0, 3], "control_steps"
+    assert Sweep(TorqueRobot(cfg), "action_delay").unit == "control_steps"
+    cfg.set_clocks(100.0, None)
+    assert cfg.motors.bus.range == [0, 6]  # 60 ms at most, as at 50 Hz
+    cfg.motors.bus.unit, cfg.control.refresh_torques = "physics_steps", False
+    assert error_of(TorqueRobot, cfg).startswith("motors.bus.unit must be control_steps")
+
+
 def test_sata(make_task):
     """Limits and the rate of new actions grow by Gompertz' curve; fatigue is observed, penalized and forgotten."""
     task = make_task("a1_sata", 3, **{"motors.delay.loss": 0.0, **HIGH_UP})
@@ -273,6 +287,8 @@ def test_sata(make_task):
             wanted = (fatigue * np.abs(5.0 * sent)).sum(axis=1)
             np.testing.assert_allclose(task._reward_fatigue(), wanted, rtol=1e-3, atol=1e-3)
     assert "one muscle" in error_of(make_task, "a1_sata", 1, **{"motors.chain": ["delay", "ideal"]})
+    for own in ({"motors.muscle.growth": 0.9}, {"motors.muscle.draws": {"growth": {"set": [0.4, 1.0]}}}):
+        assert "motors.muscle.growth and its draws have no effect" in error_of(make_task, "a1_sata", 1, **own)
 
 
 @pytest.mark.parametrize("in_torch", [False, True], ids=["kernel", "torch"])

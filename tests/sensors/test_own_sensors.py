@@ -172,6 +172,33 @@ def test_mistakes():
     assert refused.startswith("obs_groups: The MLP model only supports 1D observations") and "'camera'" in refused
 
 
+class FlatCfg(SensorCfg):
+    """Settings of a sensor with measurements of one shape, which says that they have another."""
+
+    measured: list[int] = [2]
+
+    def build(self, state):
+        flat = {"shape": lambda sensor: (3,), "measure": lambda sensor: torch.zeros(self.measured)}
+        return type("Flat", (Sensor,), flat)(self, state)
+
+
+@pytest.mark.parametrize(("shape", "delay"), [([2], 0.0), ([2], 0.04), ([2, 1], 0.0), ([2, 2], 0.04)])
+def test_other_shapes(shape, delay):
+    """A measurement of another shape than the sensor's is refused when the task is built."""
+    cfg = RayCfg()
+    cfg.env.num_envs, cfg.sensors.flat = 2, FlatCfg()
+    cfg.sensors.flat.measured, cfg.sensors.flat.delay = shape, delay
+    assert error_of(RayRobot, cfg) == f"Flat.measure returns the shape {tuple(shape)}, not (2, 3)"
+
+
+def test_the_name_of_the_height_scan():
+    """On rough ground, where it is taken, no other sensor can have it."""
+    cfg = task_registry.get_cfgs("a1_rough_torque")[0]
+    cfg.env.num_envs, cfg.terrain.num_rows, cfg.terrain.max_init_terrain_level = 2, 1, 0
+    cfg.sensors.height_scan = DownwardRayCfg()
+    assert "sensors.height_scan has the name of the height scan" in error_of(TorqueRobot, cfg)
+
+
 @pytest.mark.parametrize("changes", [{}, {"delay": 0.04}])
 def test_final_observations(changes):
     """With the option, a step also gives the observations before resets; nothing else changes."""

@@ -5,6 +5,8 @@ leave activations, too. Here the policy does not observe the trunk's velocity an
 grown robots do, with the torques of its checkpoint's age.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -26,11 +28,15 @@ class SataRobot(TorqueRobot):
     cfg: SataCfg
 
     def _init_state(self) -> None:
-        """Find the muscles, and begin to grow; a UserError without muscles."""
+        """Find the muscles, and begin to grow; a UserError without muscles, or with a growth of their own."""
         super()._init_state()
         muscles = [link for link in self.motors.links.values() if isinstance(link, MuscleModel)]
         if len(muscles) != 1:
             raise UserError(f"motors.chain must have one muscle, not {', '.join(self.motors.links)}")
+        own: Any = muscles[0].cfg
+        if own.growth != 1.0 or "growth" in own.draws:
+            path = f"{muscles[0].joints.section}.growth"
+            raise UserError(f"{path} and its draws have no effect here, where control.growth says how robots grow")
         self.muscles = muscles[0].values
         self.growth = torch.zeros(1, device=self.device)
         self.update_curriculum()

@@ -169,8 +169,10 @@ class BaseTask(VecEnv):
     def keep(self, name: str, tensor: Tensor) -> Tensor:
         """Make a tensor of a task of your own a part of :meth:`world_state_dict`, and return it.
 
-        It has a row per world, and steps write it in place. Shape: (num_envs, any).
+        It has a row per world, and steps write it in place. A UserError if the name is taken. Shape: (num_envs, any).
         """
+        if name in self._world_state:
+            raise UserError(f"task.keep has '{name}' twice; give the second tensor a name of its own")
         self._world_state[name] = tensor
         return tensor
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from legged_torque.motors.config import DelayCfg, LatencyCfg
 from legged_torque.utils.errors import UserError
 
 
@@ -26,7 +27,7 @@ def set_clocks(cfg: Any, policy_hz: float | None, physics_hz: float | None) -> f
         raise UserError(f"{name} must {rule} Hz, not {given:g}")
     cfg.sim.dt, cfg.control.decimation = 1.0 / physics if physics_hz else dt, steps
     per_physics, per_control = dt / cfg.sim.dt, dt * decimation / (cfg.sim.dt * steps)
-    for path, delay in (("motors.delay", cfg.motors.delay), ("sensing.delay", cfg.sensing.delay)):
+    for path, delay in delays(cfg).items():
         ratio = {"physics_steps": per_physics, "control_steps": per_control}.get(delay.unit, 1.0)
         delay.range = [whole_steps(f"{path}.range", value * ratio) for value in delay.range]
         delay.jitter = whole_steps(f"{path}.jitter", delay.jitter * ratio)
@@ -35,6 +36,12 @@ def set_clocks(cfg: Any, policy_hz: float | None, physics_hz: float | None) -> f
     for name in ("resampling_probability", "push_probability"):
         setattr(cfg.domain_rand, name, min(getattr(cfg.domain_rand, name) / per_control, 1.0))
     return per_control
+
+
+def delays(cfg: Any) -> dict[str, LatencyCfg]:
+    """Return settings of delays by path: of all links of motors, in the chain or not, and of sensing."""
+    links = {f"motors.{name}": link for name, link in vars(cfg.motors).items() if isinstance(link, DelayCfg)}
+    return links | {"sensing.delay": cfg.sensing.delay}
 
 
 def whole_steps(path: str, steps: float) -> int:

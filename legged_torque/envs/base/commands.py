@@ -11,6 +11,7 @@ from torch import Tensor
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.curriculum import RangeCurriculum
 from legged_torque.sim import kernels
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import yaw
 
 HEADING_GAIN = 0.5
@@ -48,12 +49,18 @@ class UniformCommands:
         if settings.curriculum:  # headings have all of their range from the start
             velocities = self.low[:3], self.span[:3]
             self.curriculum = RangeCurriculum(settings.curriculum_start, *velocities, task.max_episode_length)
-        self.hold(settings.fixed)
+        if settings.fixed:
+            self.hold(settings.fixed)
 
     def hold(self, command: Sequence[float] | None) -> None:
-        """Give all worlds one command from the next step on; None returns to drawn ones."""
+        """Give all worlds one command of three numbers from the next step on; None draws new ones."""
+        if command is not None and len(command) != len(self._held):
+            raise UserError(f"a held command is v_x, v_y and a yaw rate, not {list(command)}")
         self._is_held.fill_(command is not None)
-        self._held.copy_(torch.tensor(command or [0.0, 0.0, 0.0]))
+        if command is None:
+            self.resample(torch.ones_like(self.is_new))
+        else:
+            self._held.copy_(torch.tensor(command))
 
     def resample(self, mask: Tensor) -> None:
         """Draw new commands in the worlds of ``mask``. Shape: (num_envs,), bool."""

@@ -140,7 +140,7 @@ class Observations:
         device = values[0].device
         self.sizes: dict[str, int] = {}
         for term, value in zip(self.terms, values, strict=True):
-            _check(term, value.shape[1], self.sizes)
+            _check(term, value, num_envs, self.sizes)
             self.sizes[term.name] = value.shape[1]
         self._history_length, self._clip, self._add_noise = history_length, clip, add_noise
         scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
@@ -156,7 +156,8 @@ class Observations:
                 raise UserError(f"the observation group '{term.group}' of '{term.name}' exists already")
             if not isinstance(term.scale, (int, float)):
                 raise UserError(f"the observation '{term.name}' of a group of its own takes a single scale")
-            self.groups[term.group], shapes[term.group] = term, tuple(term.value().shape[1:])
+            _check(term, value := term.value(), num_envs, {})
+            self.groups[term.group], shapes[term.group] = term, tuple(value.shape[1:])
         self._groups = {name: torch.zeros(num_envs, *shape, device=device) for name, shape in shapes.items()}
         self.buffers = TensorDict(self._groups, batch_size=[num_envs], device=device)
         self._policy, self._critic = self._groups["policy"], self._groups["critic"]
@@ -239,10 +240,13 @@ def _marked(values: Tensor) -> Tensor:
     return values.nan_to_num(nan=math.nan, posinf=math.nan, neginf=math.nan)
 
 
-def _check(term: ObservationTerm, size: int, before: dict[str, int]) -> None:
-    """Raise a UserError if a term has a name twice, or other numbers of scales or mirrored values than of values."""
+def _check(term: ObservationTerm, values: Tensor, num_envs: int, before: dict[str, int]) -> None:
+    """Raise a UserError if a term has a name twice, another shape, or too few or many scales or mirrored values."""
     if term.name in before:
         raise UserError(f"two observation terms are called '{term.name}'")
+    if len(values.shape) < 2 or len(values) != num_envs or (len(values.shape) > 2 and not term.group):
+        raise UserError(f"observation '{term.name}' has the shape {tuple(values.shape)}, not ({num_envs}, size)")
+    size = math.prod(values.shape[1:])
     scales, mirrored = len(_per_value(term.scale, size)), len(term.mirror.order) if term.mirror else size
     if (scales, mirrored) != (size, size):
         raise UserError(

@@ -13,6 +13,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim import kernels
 from legged_torque.sim.engine import Engine, shared_field
 from legged_torque.sim.randomization import Randomization, RandomParameter
+from legged_torque.utils.errors import UserError
 
 PUSH_ADDED = 0.5  # share of pushes that add a velocity; the others set one, times ``push_set_factor``
 
@@ -35,7 +36,13 @@ class RandomEvents:
         initial_state: Sequence[RandomParameter],
         parameters: Sequence[RandomParameter],
     ) -> None:
-        """Prepare; nothing is drawn yet. ``init_angles`` are among the fields of ``initial_state``."""
+        """Prepare; nothing is drawn yet. ``init_angles`` are among the fields of ``initial_state``.
+
+        A UserError if two parameters have one name: they would share their draws.
+        """
+        names = [parameter.name for parameter in (*initial_state, *parameters)]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise UserError(f"two random parameters are called '{twice[0]}'")
         settings = self._settings = cfg.domain_rand
         self._sim, self._commands, self.init_angles = sim, commands, init_angles
         device, n = sim.device, sim.num_envs

@@ -12,7 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_torque.envs.base.clocks import delays
 from legged_torque.envs.base.metrics import WalkingMetrics
+from legged_torque.motors.config import DelayCfg
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.metrics import estimate
 from legged_torque.utils.options import DELAYS, PUSH
@@ -32,7 +34,10 @@ class Sweep:
 
     def __init__(self, task: Any, name: str) -> None:
         """Start with empty sums; a UserError if the parameter has one value only, or several numbers of its own."""
-        setting = DELAYS.get(name, f"domain_rand.{name}")
+        setting, links = DELAYS.get(name, f"domain_rand.{name}"), task.motors.links.items()
+        if name == "action_delay":
+            own = (f"motors.{key}.range" for key, link in links if isinstance(link.cfg, DelayCfg))
+            setting = next(own, setting)
         kinds = (task.events.parameters, task.events.initial_state)
         drawn = next((kind for kind in kinds if name in kind.sizes), None)
         if drawn is None:
@@ -51,7 +56,7 @@ class Sweep:
         self.name, self._values, self._sign = name, drawn.values[:, place], sign
         self.unit, parts = next(each.unit for each in drawn.parameters if each.name == name), NUM_PARTS
         if name in DELAYS:
-            unit = getattr(task.cfg, setting.split(".")[0]).delay.unit
+            unit = delays(task.cfg)[setting.removesuffix(".range")].unit
             low, high, self.unit = round(low), round(high), unit.replace("milliseconds", "physics_steps")  # as counted
             parts = high - low
         self.edges = [float(f"{edge:.6g}") for edge in torch.linspace(low, high, parts + 1).tolist()]  # of float32

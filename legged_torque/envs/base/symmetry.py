@@ -103,9 +103,9 @@ class Mirror:
             self.maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 
     def __call__(self, name: str, values: Tensor) -> Tensor:
-        """Return the mirror image of "policy", "critic" or "actions". Shape: (samples, size)."""
+        """Return the mirror image of a group of observations or of "actions". Shape: (samples, any)."""
         order, signs = self.maps[name]
-        return values.index_select(1, order) * signs
+        return (values.flatten(1).index_select(1, order) * signs).view(values.shape)
 
 
 def with_mirror_images(

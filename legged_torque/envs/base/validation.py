@@ -1,5 +1,6 @@
 """Validate the settings of a task before anything is built."""
 
+from legged_torque.envs.base.clocks import delays
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.errors import UserError, check_names
@@ -22,12 +23,13 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
         _check_map(cfg)
     parameters = cfg.random_parameters()
     check_names("parameter in domain_rand.keep_fixed", cfg.domain_rand.keep_fixed, parameters)
-    delay = cfg.motors.delay
-    if (delay.range[1] or delay.jitter) and delay.unit != "control_steps" and not cfg.control.refresh_torques:
-        raise UserError(
-            "motors.delay.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
-            "per control step"
-        )
+    for path, delay in delays(cfg).items():
+        is_in_steps = (delay.range[1] or delay.jitter) and delay.unit != "control_steps"
+        if is_in_steps and path.removeprefix("motors.") in cfg.motors.chain and not cfg.control.refresh_torques:
+            raise UserError(
+                f"{path}.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
+                "per control step"
+            )
 
 
 def _check_engine(cfg: LeggedRobotCfg) -> None:
