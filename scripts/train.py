@@ -18,13 +18,15 @@ import contextlib
 import functools
 import shlex
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.tasks import list_tasks
+from legged_torque.motors.model_config import ASSUMED_VOLTAGE
 from legged_torque.utils import cli, distributed
-from legged_torque.utils.config import flat, to_dict
+from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
@@ -71,6 +73,8 @@ def main() -> None:
                 use_first_run(options)
             run = task_registry.load_run(options)
         env_cfg, train_cfg, options.task = run.env_cfg, run.train_cfg, run.task
+        if train_cfg.seed != (kept_seed := run.config["train"].get("seed", train_cfg.seed)):
+            raise UserError(f"the seed of a resumed run, which goes on with its random numbers, stays {kept_seed}")
         train_cfg.distillation.teachers = list(map(str, find_teachers(train_cfg, options.log_root)))
         options.load_run, options.preset = str(run.folder), run.config.get("preset")
         options.max_iterations = options.max_iterations or given_iterations(run.config)
@@ -109,12 +113,42 @@ def main() -> None:
 
 def new_settings(options: Options) -> tuple[Any, Any]:
     """Return the settings of a task and its training; on a CPU, those of the preset for it unless another is given."""
-    env_cfg, train_cfg = task_registry.get_new_cfgs(options)
-    is_open = options.preset is None and CPU_PRESET in train_cfg.presets()
-    if is_open and resolve_device(options.device) == "cpu":
-        options.preset = CPU_PRESET
-        return task_registry.get_new_cfgs(options)
-    return env_cfg, train_cfg
+    before = task_registry.get_new_cfgs(options)
+    is_open = options.preset is None and CPU_PRESET in before[1].presets()
+    if not is_open or resolve_device(options.device) != "cpu":
+        return before
+    options.preset = CPU_PRESET
+    after = task_registry.get_new_cfgs(options)
+    names = ", ".join(name for pair in zip(before, after, strict=True) for name in replaced(*pair))
+    note = f"on a CPU, the preset {CPU_PRESET} replaces the task's own {names}; --preset {DEFAULT_PRESET} keeps them"
+    print_notes([note if names else ""])
+    return after
+
+
+def replaced(before: Any, after: Any, path: str = "") -> Iterator[str]:
+    """Yield the names of settings of classes outside this package that have other values afterwards."""
+    for key in section_keys(before):
+        old, new = getattr(before, key), getattr(after, key)
+        if isinstance(old, Section):
+            yield from replaced(old, new, f"{path}{key}.")
+        elif old != new and key != "num_envs":  # which is num_envs_cpu, whatever the preset
+            owner = next(cls for cls in type(before).__mro__ if key in vars(cls))
+            if not owner.__module__.startswith("legged_torque."):
+                yield f"{path}{key}"
+
+
+def draws_note(env_cfg: Any) -> str:
+    """Return the note that constants of motors are not drawn although they have ranges, other than batteries have."""
+    links = ((name, getattr(getattr(env_cfg.motors, name), "draws", {})) for name in env_cfg.motors.chain)
+    names = ", ".join(f"motors.{name}.draws" for name, draws in links if draws not in ({}, ASSUMED_VOLTAGE))
+    note = f"{names} needs domain_rand.randomize_parameters=true, which --perturbation low sets"
+    return note if names and not env_cfg.domain_rand.randomize_parameters else ""
+
+
+def also_note(cfg: Any, steps: int) -> str:
+    """Return the note that a training of so many steps ends before ``evaluation.also`` begins; empty if it does not."""
+    note = f"evaluation.also measures nothing: evaluation.also_from is {cfg.also_from:,}, but there are {steps:,} steps"
+    return note if cfg.also and cfg.interval and steps < cfg.also_from else ""
 
 
 def length_note(train_cfg: Any) -> str:
@@ -143,7 +177,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     env, _ = task_registry.make_env(options.task, options, env_cfg)
     stopwatch.lap("task")
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
-        print_notes([standing_note(env)])
+        print_notes([standing_note(env), draws_note(env_cfg)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if train_cfg.pretraining.function and not options.resume and is_first:  # from whom the others get their networks
         from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
@@ -166,6 +200,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         further = f"{cli.script_command('train')} {shlex.join(command)}"
         raise UserError(f"the run has all of its {counted(done, 'iteration')}; to go on: {further}")
     if is_first:
+        steps += remaining * distributed.world_size() * env.num_envs * train_cfg.runner.num_steps_per_env
+        print_notes([also_note(train_cfg.evaluation, steps)])
         if env.device == "cpu":
             is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
             threads = max(torch.get_num_threads(), distributed.world_size())

@@ -64,7 +64,7 @@ class Section:
             setattr(self, key, value)
 
     def check(self, path: str = "") -> None:
-        """Raise a UserError that names all settings, here and below, with values that are not allowed.
+        """Raise a UserError that names all settings, here and below, that the class lacks or whose values are wrong.
 
         ``path`` is where the section stands in its configuration.
         """
@@ -72,10 +72,10 @@ class Section:
         for key in section_keys(self):
             value, dotted = getattr(self, key), f"{path}.{key}" if path else key
             with collect_errors(problems):
-                if isinstance(value, Section):
+                if isinstance(value, Section):  # which may be new, as in a class
                     value.check(dotted)
                 else:
-                    check_value(dotted, value, _type_of(self, key))
+                    check_value(_dotted(path, key, self._names), value, _type_of(self, key))
         refuse(problems)
 
 
@@ -125,7 +125,7 @@ class BaseConfig(Section):
         refuse([successor("settings", path) or text for path, text in mistakes.items()], advice=advice)
 
     def check(self, path: str = "") -> None:
-        """Refuse mistakes in names, then values that are not allowed, by UserError."""
+        """Refuse mistakes in the classes' names, then in the instances' names and values, by UserError."""
         self.refuse_mistakes()
         super().check(path)
 

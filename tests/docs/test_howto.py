@@ -15,6 +15,7 @@ import warp
 from support.command import command
 from support.pages import fences, make, python_files, train
 from support.scripts import run_here
+from support.settings import parse
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser
@@ -150,7 +151,11 @@ def test_approach(run_page):
 
 
 def test_motor(run_page):
-    """The rate limit acts inside the kernel: 1.5 N m per physics step; a network is the TorchScript file's."""
+    """The lag is drawn; the rate limit acts in the kernel: 1.5 N m per physics step; a network is TorchScript's."""
+    words = next(words for *_, words in calls_of("docs/howto/motor.md") if "motors.lag.draws" in str(words))
+    drawing, _ = task_registry.make_env("a1_torque", parse(*words, "--num_envs=4"))
+    lags = drawing.motors.links["lag"].values.time_constant
+    assert 0.001 <= lags.min() < lags.max() <= 0.003
     names, network = run_page("docs/howto/motor.md"), torch.nn.Sequential(torch.nn.Linear(6, 8), torch.nn.Softsign())
     network.append(torch.nn.Linear(8, 1))
     torch.jit.script(network).save("net.pt")

@@ -147,10 +147,11 @@ TEXTS = {
     "python": ("!!python/object/apply:payload.run []", "is not valid YAML"),
     "deep": ("[" * 1000 + "]" * 1000, "is nested too deeply"),
     "itself": ("&a [*a]", "is nested too deeply"),
+    "twice": ("a: 1\nb: {c: 1, c: 2}", "is not valid YAML: line 2 has the key 'c' a second time"),
     "huge": (f"a: {'9' * 1000}", "is nested too deeply or larger"),
     "many": ("\n".join(["a: &a0 [x]", *(f"b{i}: &a{i + 1} [{f'*a{i}, ' * 9}]" for i in range(12))]), "is nested too"),
 }
-"""YAML that runs code, or takes all of the memory or the stack, and what is reported."""
+"""YAML that runs code, hides one value by another, or takes all of the memory or the stack, and what is reported."""
 
 
 @pytest.mark.parametrize("name", TEXTS)

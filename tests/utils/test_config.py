@@ -174,6 +174,17 @@ def test_misspelt_names_are_refused(text, told):
     assert told in message and "\n" not in message
 
 
+def test_misspelt_settings_of_objects_are_refused():
+    """So are old names, when a task is made of the objects; a link of one's own is none of them."""
+    env_cfg, _ = task_registry.get_cfgs("a1_torque")
+    env_cfg.motors.own = type(env_cfg.motors.lag)()
+    env_cfg.check()
+    env_cfg.domain_rand.randomise_parameters, env_cfg.motors.model, env_cfg.motors.own.time = True, "real", 1.0
+    said = error_of(task_registry.make_env, "a1_torque", parse(), env_cfg)
+    for part in ("did you mean 'domain_rand.randomize_parameters'?", "'motors.model' is now motors.chain", "own.time'"):
+        assert part in said
+
+
 class Port(Both):
     """Settings with many mistakes, in sections of both kinds and in a section of a section."""
 

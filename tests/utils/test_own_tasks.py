@@ -7,7 +7,7 @@ import sys
 import pytest
 import yaml
 from support.scripts import ROOT, assert_light, assert_told_in_one_line, contents, run_here
-from support.settings import error_of
+from support.settings import error_of, parse
 
 from legged_torque.envs import task_registry
 from legged_torque.experiments.matrix import CellState, read_matrix, step_words
@@ -84,6 +84,38 @@ def test_a_run_names_no_file(tmp_path):
 def test_answers_come_before_torch(tmp_path):
     """A file whose class is only named is listed without anything heavy."""
     assert_light({("train.py", "--list", f"--task_file={FILE}"): 0}, tmp_path)
+
+
+OWN = """from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, task_registry
+
+class OwnCfgPPO(A1TorqueCfgPPO):
+    class runner: total_steps, num_steps_per_env = 128_000, 8
+    class actor: hidden_dims = [64, 64]
+    class critic: hidden_dims = [128, 128]
+
+class OwnCfg(A1TorqueCfg):
+    class env: num_envs = 512
+
+task_registry.register("own", "legged_torque.envs:TorqueRobot", OwnCfg(), type("Variant", (OwnCfgPPO,), {})())
+"""
+
+
+@pytest.mark.parametrize(("task", "kept"), [("own", ""), ("own", "runner.total_steps"), ("a1_torque", "")])
+def test_what_the_preset_for_cpus_replaces(task, kept, tmp_path, capsys):
+    """A note names the settings of the file that change, not those of the library, and a preset that keeps them."""
+    (tmp_path / "theirs.py").write_text(OWN)
+    task_registry.import_files([tmp_path / "theirs.py"])
+    new_settings = runpy.run_path(str(ROOT / "scripts" / "train.py"))["new_settings"]
+    options = parse(f"--task={task}", *([f"--set={kept}=256000"] if kept else []))
+    _, train_cfg = new_settings(options)
+    assert options.preset == "laptop" and train_cfg.actor.hidden_dims == [128, 128]
+    names = [name for name in ("runner.total_steps", "actor.hidden_dims") if name != kept]
+    said = f"Note: on a CPU, the preset laptop replaces the task's own {', '.join(names)}; --preset parallel keeps them"
+    assert capsys.readouterr().out == (f"{said}\n" if task == "own" else "")
+    if task == "own":
+        _, train_cfg = new_settings(parse("--task=own", "--preset=parallel"))
+        assert (train_cfg.runner.total_steps, train_cfg.actor.hidden_dims) == (128_000, [64, 64])
+        assert not capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
