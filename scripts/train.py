@@ -126,15 +126,15 @@ def new_settings(options: Options) -> tuple[Any, Any]:
 
 
 def replaced(before: Any, after: Any, path: str = "") -> Iterator[str]:
-    """Yield the names of settings of classes outside this package that have other values afterwards."""
+    """Yield the names of settings that differ from this package's and have other values afterwards."""
+    kind: Any = next(cls for cls in type(before).__mro__ if cls.__module__.startswith("legged_torque."))
+    ours = vars(kind())
     for key in section_keys(before):
         old, new = getattr(before, key), getattr(after, key)
         if isinstance(old, Section):
             yield from replaced(old, new, f"{path}{key}.")
-        elif old != new and key != "num_envs":  # which is num_envs_cpu, whatever the preset
-            owner = next(cls for cls in type(before).__mro__ if key in vars(cls))
-            if not owner.__module__.startswith("legged_torque."):
-                yield f"{path}{key}"
+        elif old not in (new, ours.get(key)) and key != "num_envs":  # which is num_envs_cpu, whatever the preset
+            yield f"{path}{key}"
 
 
 def draws_note(env_cfg: Any) -> str:

@@ -129,7 +129,8 @@ def _prepare_urdf(root: ET.Element, what: str) -> None:
     for part in root.findall("material"):
         root.remove(part)
     for joint in root.findall("joint[@type='revolute']"):
-        for limit in joint.findall("limit[@lower]") or joint.findall("limit[@upper]"):
+        limit = joint.find("limit")
+        if limit is not None and limit.attrib.keys() & {"lower", "upper"}:
             low, high = limit.attrib.setdefault("lower", "0"), limit.attrib.setdefault("upper", "0")
             if float(low) > float(high):
                 raise UserError(f"{what}: the range of '{joint.get('name')}' must be in order, not {low} to {high}")

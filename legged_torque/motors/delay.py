@@ -26,7 +26,7 @@ class ActionDelay(Motor):
     def __init__(self, cfg: DelayCfg, joints: Joints) -> None:
         """Allocate room for the longest delay; a UserError if it is not a whole number of physics steps."""
         super().__init__(cfg, joints)
-        times, jitter, unit_steps = cfg.counted("motors.delay", joints.dt, joints.decimation)
+        times, jitter, unit_steps = cfg.counted(joints.section, joints.dt, joints.decimation)
         self.queue = PacketQueue(joints.actions, joints.decimation, times, unit_steps, jitter, cfg.loss)
 
     def send(self, actions: Tensor) -> None:

@@ -51,9 +51,9 @@ def fault(state: RobotState, age: float, received: Received, joints: Joints, bra
         return f"{received.wrong_crc} messages with a wrong checksum"
     if received.problems:
         return received.problems[0]
-    parts = (state.quaternion, state.angular_velocity, state.joint_positions, state.joint_velocities)
-    if not all(np.isfinite(part).all() for part in (*parts, state.temperatures, state.errors)):
-        return "a measurement is not finite"
+    for name in ("quaternion", "angular_velocity", "joint_positions", "joint_velocities", "temperatures", "errors"):
+        if not np.isfinite(getattr(state, name)).all():
+            return f"a measurement is not finite, of {name}"
     if abs((length := float(np.linalg.norm(state.quaternion))) - 1.0) > MAX_LENGTH_ERROR:
         return f"the trunk's orientation is a quaternion of length {length:.2g}, not 1"
     if (tilt := tilt_of(state.quaternion)) > brakes.max_tilt:

@@ -31,7 +31,7 @@ class Chirp(Policy):
     has_ended = False
 
     def __init__(self, policy: Policy, rate: float, seconds: float) -> None:
-        """Take the robot and the gains of a policy, for so many ticks a second; a UserError for too few or no gains."""
+        """Take a policy's robot and gains, for so many ticks a second; a UserError for too few ticks, or no gains."""
         if rate < (least := PER_TURN * FREQUENCIES[1]):
             raise UserError(f"--rate must be at least {least:g} for the {FREQUENCIES[1]:g} Hz of --chirp, not {rate:g}")
         vars(self).update(vars(policy))

@@ -20,7 +20,7 @@ class RobotState:
     joint_positions: np.ndarray  # [rad]; (joints,)
     joint_velocities: np.ndarray  # [rad/s]; (joints,)
     joint_torques: np.ndarray  # as the drives estimate them [N m]; (joints,)
-    temperatures: np.ndarray  # of the motors [deg C]; (joints,)
+    temperatures: np.ndarray  # of the motors [deg C], 0 where there is no sensor; (joints,)
     errors: np.ndarray  # error flags of the motors, 0 is none; (joints,)
     identity: np.ndarray = field(default_factory=lambda: np.zeros(4, int))  # version of firmware, serial number; (4,)
 

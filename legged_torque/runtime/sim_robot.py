@@ -126,13 +126,14 @@ class SimRobot:
             self._on_their_way.append((self.data.time + self._latency, received.newest))
         zeros = np.zeros(len(self.joint_order))
         damping, had_command = MotorCommand(zeros, zeros, zeros, zeros, zeros + DAMPING), self._command is not None
-        is_dead = np.isin(self.joint_order, self.faults.dead)
+        is_dead, was_damping = np.isin(self.joint_order, self.faults.dead), False
         self._drives.begin()
         for _ in range(self._steps):
             while self._on_their_way and self._on_their_way[0][0] <= self.data.time + 1e-9:
                 self._command, self._age = self._on_their_way.popleft()[1], 0.0
             command = self._command if self._age <= WATCHDOG else None
             self.is_damping = command is None
+            was_damping |= self.is_damping
             pos, vel = self.data.qpos[self._qpos], self.data.qvel[self._dofs]
             asked = (command or damping).torques(*self._drives.measured(pos, vel))
             if command is not None:
@@ -140,7 +141,7 @@ class SimRobot:
             self._applied = np.where(is_dead, 0.0, self._drives.apply(asked, pos, vel))
             self.data.ctrl[self._motors] = self._applied / self._torque_per_control
             mujoco.mj_step(self.model, self.data)
-        self.watchdog_ticks += had_command and self.is_damping
+        self.watchdog_ticks += had_command and was_damping
 
     def _description(self, motors: MotorsCfg | None) -> dict[str, Any]:
         """Return what the motors read of a ``policy.yaml``, at the rate of the physics."""

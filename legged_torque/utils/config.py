@@ -13,6 +13,8 @@ from legged_torque.utils.errors import UserError, collect_errors, refuse, unknow
 from legged_torque.utils.limits import check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
 
+DECLARE = "to declare new ones, annotate a setting (name: float = ...), derive a section from Section"
+
 
 class Section:
     """A part of a configuration: its settings are class attributes, its sections are nested classes.
@@ -68,15 +70,16 @@ class Section:
 
         ``path`` is where the section stands in its configuration.
         """
-        problems: list[str] = []
+        problems, advice = list[str](), ""
         for key in section_keys(self):
             value, dotted = getattr(self, key), f"{path}.{key}" if path else key
             with collect_errors(problems):
                 if isinstance(value, Section):  # which may be new, as in a class
                     value.check(dotted)
                 else:
+                    advice = advice if key in self._names else DECLARE
                     check_value(_dotted(path, key, self._names), value, _type_of(self, key))
-        refuse(problems)
+        refuse(problems, advice=advice)
 
 
 def _is_entry(name: str, value: Any) -> bool:
@@ -121,8 +124,7 @@ class BaseConfig(Section):
         legged_gym's names have their successors, others the nearest names.
         """
         mistakes = {path: text for part in (cls, *others) for path, text in part._mistakes.items()}
-        advice = "to declare new ones, annotate a setting (name: float = ...), derive a section from Section"
-        refuse([successor("settings", path) or text for path, text in mistakes.items()], advice=advice)
+        refuse([successor("settings", path) or text for path, text in mistakes.items()], advice=DECLARE)
 
     def check(self, path: str = "") -> None:
         """Refuse mistakes in the classes' names, then in the instances' names and values, by UserError."""

@@ -18,7 +18,10 @@ PD_CONTROL = "position_residual"  # name of the action term with joint positions
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A task after one control step. Without another word, values are those of the followed world."""
+    """A task after a control step, and what users have changed since.
+
+    Without another word, values are those of the followed world.
+    """
 
     time: float  # simulated time since the session's start [s]
     world: int  # the followed world

@@ -196,7 +196,7 @@ def read_training(cell: Cell, runs: list[Path]) -> Training:
                 if name == cell.environment:
                     most, end = before["steps"].max() / MILLION, rows["steps"].iloc[-1] / MILLION
                     if most > end:
-                        later = f"the later '{run_dir.name}', which ends after {end:.4g}, counts"
+                        later = f"the later '{run_dir.name}', which ends after {end:.4g} million, counts"
                         training.problems.append(f"'{earlier}' has {most:.4g} million steps, but {later}")
                     earlier = run_dir.name
     files = [*cell.folder.glob("result_*.json"), *cell.folder.glob("*/result_*.json")]

@@ -148,7 +148,7 @@ def test_numbers_that_hide_others():
     for name in ("temperatures", "errors"):
         numbers = np.where(np.arange(12) == 3, np.nan, np.where(np.arange(12) == 5, 130.0, 0.0))
         said = fault(replace(state, **{name: numbers}), 0.0, Received(), joints, Brakes())
-        assert said == "a measurement is not finite"
+        assert said == f"a measurement is not finite, of {name}"
 
 
 def test_from_lying_to_walking_and_back(policy):

@@ -181,7 +181,12 @@ def test_misspelt_settings_of_objects_are_refused():
     env_cfg.check()
     env_cfg.domain_rand.randomise_parameters, env_cfg.motors.model, env_cfg.motors.own.time = True, "real", 1.0
     said = error_of(task_registry.make_env, "a1_torque", parse(), env_cfg)
-    for part in ("did you mean 'domain_rand.randomize_parameters'?", "'motors.model' is now motors.chain", "own.time'"):
+    for part in (
+        "did you mean 'domain_rand.randomize_parameters'?",
+        "'motors.model' is now motors.chain",
+        "own.time'",
+        "annotate",
+    ):
         assert part in said
 
 

@@ -105,7 +105,7 @@ class CommandBreakdown:
         self._task = task
         ranges = task.cfg.commands.allowed()
         self._ranges = torch.tensor([ranges[name] for name in COMMANDS], device=task.device)
-        shape = (task.num_envs, len(COMMANDS), NUM_BINS + 1)  # the last: outside of the range, as those of 0 may be
+        shape = (task.num_envs, len(COMMANDS), NUM_BINS + 1)  # the last: commands of 0 outside of the range
         self._sums = torch.zeros(4, *shape, device=task.device)
 
     def add_step(self, commands: Tensor) -> None:
@@ -117,8 +117,8 @@ class CommandBreakdown:
         tracking = torch.stack(metrics.tracking_percentage(torch, error[:, :tracked], commands[:, :tracked]))
         low, high = self._ranges.T
         place = ((commands - low) / (high - low).clamp(min=1e-6) * NUM_BINS).long().clamp(0, NUM_BINS - 1)
-        is_outside = (commands - commands.clamp(low, high)).abs() > 1e-5  # rounding aside
-        place = place.masked_fill(is_outside, NUM_BINS)
+        stands = (commands == 0.0) & ((low > 0.0) | (high < 0.0))
+        place = place.masked_fill(stands, NUM_BINS)
         member = torch.nn.functional.one_hot(place, NUM_BINS + 1) * ~task.state.reset_buf.view(-1, 1, 1)
         rows = torch.stack([torch.ones_like(error), error, *tracking.unsqueeze(2).expand(-1, *error.shape)])
         self._sums += rows.unsqueeze(3) * member

@@ -245,7 +245,8 @@ def _check(term: ObservationTerm, values: Tensor, num_envs: int, before: dict[st
     if term.name in before:
         raise UserError(f"two observation terms are called '{term.name}'")
     if len(values.shape) < 2 or len(values) != num_envs or (len(values.shape) > 2 and not term.group):
-        raise UserError(f"observation '{term.name}' has the shape {tuple(values.shape)}, not ({num_envs}, size)")
+        wanted = f"({num_envs}, {'...' if term.group else 'size'})"
+        raise UserError(f"observation '{term.name}' has the shape {tuple(values.shape)}, not {wanted}")
     size = math.prod(values.shape[1:])
     scales, mirrored = len(_per_value(term.scale, size)), len(term.mirror.order) if term.mirror else size
     if (scales, mirrored) != (size, size):
