@@ -51,7 +51,7 @@ class Background:
 def on_host(content: Any) -> Any:
     """Return nested containers with copies of all tensors, in the memory of the host; waits once for all of them."""
     copies = tree_map_only(Tensor, lambda tensor: tensor.detach().to("cpu", non_blocking=True, copy=True), content)
-    if torch.cuda.is_available():
+    if torch.cuda.is_initialized():  # in a training on a CPU, it would start CUDA
         torch.cuda.synchronize()
     return copies
 

@@ -247,7 +247,7 @@ def test_mistakes():
 
 
 def test_a_delay_of_another_name():
-    """Its range in control steps stays the same in time, is told in its unit, and may be no part of a control step."""
+    """Its range keeps its time at another rate, sweeps name its unit, and parts of a control step may be refused."""
     cfg = OwnMotorsCfg()
     cfg.env.num_envs, cfg.motors.chain = 2, ["bus", "curve"]
     assert "give motors.bus.range" in error_of(lambda: Sweep(TorqueRobot(cfg), "action_delay"))
