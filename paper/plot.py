@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from legged_torque.paper.plotting import load_pyplot, save_figure
+from legged_torque.paper.plotting import load_pyplot, parse_figure, save_figure
 from legged_torque.paper.report import check_extra
-from legged_torque.utils.cli import Parser, check_output, slow_imports
+from legged_torque.utils.cli import slow_imports
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import read_data
 
@@ -20,13 +19,8 @@ BLUE, ORANGE = "#0072B2", "#D55E00"  # which colour-blind readers can tell apart
 
 def plot_curves() -> None:
     """Draw a panel per metric and a line per training."""
-    example = "python scripts/plot.py curves CURVES.csv.gz --out curves.png"
-    parser = Parser(f"Draw learning curves (Figure 3): ``{example}``.")
-    help_text = "evaluations.csv of a run, or evaluations.csv.gz of a report"
-    parser.add_argument("files", type=Path, nargs="+", help=help_text)
-    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
-    args = parser.parse_args()
-    check_output(args.out)
+    text = "Draw learning curves (Figure 3): ``python scripts/plot.py curves CURVES.csv.gz --out curves.png``."
+    args = parse_figure(text, "files", "evaluations.csv of a run, or evaluations.csv.gz of a report", nargs="+")
     with slow_imports():
         check_extra()
         from legged_torque.paper.report.figures_curves import draw_single_curves
@@ -36,11 +30,8 @@ def plot_curves() -> None:
 def plot_pretraining() -> None:
     """Draw torques, residuals, learning and standing of a pre-training in four panels."""
     example = "python scripts/plot.py pretraining report.json --out pretraining.png"
-    parser = Parser(f"Draw a report on gravity pre-training: ``{example}``.")
-    parser.add_argument("file", type=Path, help="report of pretrain_gravity.py --json")
-    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
-    args = parser.parse_args()
-    check_output(args.out)
+    text = f"Draw a report on gravity pre-training: ``{example}``."
+    args = parse_figure(text, "file", "report of pretrain_gravity.py --json")
     figure, axes = load_pyplot().subplots(1, 4, figsize=(17, 4), layout="constrained")
     report = read_data(args.file, {"histograms", "settings", "rms_error", "standing"}, "pretrain_gravity.py")
     try:

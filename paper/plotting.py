@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.cli import Parser, check_output
+from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.files import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def parse_figure(description: str, name: str, help_text: str, **how: Any) -> argparse.Namespace:
+    """Return the command line of a figure: what it is made of, ``name``, and the file to write, ``out``."""
+    parser = Parser(description)
+    parser.add_argument(name, type=Path, help=help_text, **how)
+    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
+    args = parser.parse_args()
+    check_output(args.out)
+    return args
+
+
 def load_pyplot() -> ModuleType:
     """Return ``matplotlib.pyplot``, set up to write files and open no windows; UserError if it is missing."""
-    try:
-        import matplotlib
+    require("matplotlib", extra="plots")
+    import matplotlib
 
-        matplotlib.use("agg")
-        from matplotlib import pyplot
-    except ImportError:
-        raise UserError("plots need the extra: pip install 'legged_torque[plots]'") from None
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
     return pyplot
 
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from legged_torque.paper.plotting import load_pyplot, save_figure
+from legged_torque.paper.plotting import load_pyplot, parse_figure, save_figure
 from legged_torque.paper.report import check_extra
-from legged_torque.utils.cli import Parser, check_output
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import read_data
 
@@ -28,12 +26,8 @@ def plot_sweeps() -> None:
 
     Bands are 95% intervals, over worlds if there is one file, else over the files of different seeds.
     """
-    example = "python scripts/plot.py sweeps sweeps/*.json --out sweeps.png"
-    parser = Parser(f"Draw what policies bear: ``{example}``.")
-    parser.add_argument("files", type=Path, nargs="+", help="JSON of evaluate.py --sweep")
-    parser.add_argument("--out", type=Path, required=True, help="figure to write (png, svg, pdf)")
-    args = parser.parse_args()
-    check_output(args.out)
+    text = "Draw what policies bear: ``python scripts/plot.py sweeps sweeps/*.json --out sweeps.png``."
+    args = parse_figure(text, "files", "JSON of evaluate.py --sweep", nargs="+")
     check_extra()
     pyplot = load_pyplot()
     script, lines = "evaluate.py --sweep", defaultdict[tuple[str, str, str], list[dict[str, Any]]](list)
@@ -61,6 +55,8 @@ def plot_sweeps() -> None:
 
 def _draw(axis: Axes, sweeps: list[dict[str, Any]], label: str, colour: str) -> None:
     """Draw tracking, or the share that falls after a push, in the middle of each part; a delay is a whole number."""
+    from scipy.stats import t
+
     from legged_torque.paper.report.experiment import read_sweep  # needs the extra plots
 
     sweep, tables = sweeps[0], [read_sweep(each) for each in sweeps]
@@ -69,15 +65,8 @@ def _draw(axis: Axes, sweeps: list[dict[str, Any]], label: str, colour: str) -> 
     if count == 1:
         half = 1.96 * tables[0]["standard_error"]
     else:
-        half = student(count) * means.std(axis=0, ddof=1) / math.sqrt(count)
+        half = t.ppf(0.975, count - 1) * means.std(axis=0, ddof=1) / math.sqrt(count)
     axis.fill_between(x, mean - half, mean + half, color=colour, alpha=0.25, linewidth=0)
     axis.plot(x, mean, color=colour, marker=".", label=label)
     axis.set(ylim=(0.0, 1.0), xlabel=f"{sweep['parameter']} [{sweep['unit']}]" if sweep["unit"] else sweep["parameter"])
     axis.set_ylabel("share that falls" if tables[0]["is_push"].iloc[0] else "tracking")
-
-
-def student(count: int) -> float:
-    """Return how many standard errors of a mean of ``count`` numbers are half its 95% interval."""
-    from scipy.stats import t
-
-    return float(t.ppf(0.975, count - 1))

@@ -94,7 +94,7 @@ def main() -> None:
     session = Session(controller, transport, log)
     loop = RealTimeLoop(args.rate, session.tick)
     view, end = View(session, loop, operators), time.monotonic() + (args.seconds or float("inf"))
-    ended, aside, identity = threading.Event(), ThreadPoolExecutor(), [0] * 4  # of those that do not tell theirs
+    ended, aside = threading.Event(), ThreadPoolExecutor()
 
     def repeat(act: Callable[[], None]) -> None:
         """Act again and again, in a thread of its own: a disk or a terminal may keep it waiting, and nothing else."""
@@ -103,19 +103,11 @@ def main() -> None:
         while not ended.wait(POLL):
             act()
 
-    def tell() -> None:
-        """Say which robot it is, once, and draw the view."""
-        if controller.state is not None and controller.state.identity.tolist() != identity:
-            identity[:] = controller.state.identity.tolist()
-            said = f"the robot's firmware is {identity[:2]}, its serial number {identity[2:]}"
-            say(partial(print, said, flush=True))
-        say(view.show)
-
     with StopRequest(lambda text: None) as stop, contextlib.ExitStack() as parts:
         for part in (view.live, *operators, aside, contextlib.closing(session), loop):  # left in the reverse order
             parts.enter_context(part)
         parts.callback(ended.set)
-        repeated = [aside.submit(repeat, act) for act in (tell, *([log.write] if log else []))]
+        repeated = [aside.submit(repeat, act) for act in (partial(say, view.show), *([log.write] if log else []))]
         while not (stop.requested or time.monotonic() > end or loop.error or any(each.done() for each in repeated)):
             for operator in operators:
                 operator.look()

@@ -51,7 +51,10 @@ def main() -> None:
     if args.dry_run:
         check_same(matrix, out)
         for cell in matrix.cells(out):
-            print(f"{cell.name}: {cell_state(cell)}")
+            try:
+                print(f"{cell.name}: {cell_state(cell)}")
+            except UserError as error:  # with which this cell would fail, and no other
+                print(f"{cell.name}: {error}")
         return
     with multi_process_service() if args.mps else contextlib.nullcontext({}) as variables:
         if isinstance(launcher, LocalLauncher):

@@ -17,7 +17,7 @@ from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import write_json, write_whole
 from legged_torque.utils.options import MOTOR_FILES
-from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.plain_yaml import dump_yaml
 
 UNITS = ("kg m^2", "N m s/rad", "N m", "rad")
 
@@ -73,8 +73,6 @@ def main() -> None:
 
 def settings_text(names: list[str], values: dict[str, Any], step: float, fields: dict[str, str]) -> str:
     """Return settings of motors as YAML, with a delay of whole physics steps [s]."""
-    import yaml
-
     steps, offset = max(round(values["delay"][0] / step), 0), float(f"{abs(values['bias']).max():.2g}")
     delay = {"unit": "physics_steps", "range": [steps, steps]}
     if (1e3 * step).is_integer():  # which holds for other physics steps, too
@@ -84,8 +82,7 @@ def settings_text(names: list[str], values: dict[str, Any], step: float, fields:
         rounded = (float(f"{value:.4g}") for value in values[key])
         joints[field.removeprefix("dof_")] = dict(zip(names, rounded, strict=True))
     drawn = {"keep_fixed": list(fields.values()), "joint_offset": {"add": [-offset, offset]}}
-    content = {"motors": {"joints": joints, "delay": delay}, "domain_rand": drawn}
-    return yaml.dump(content, Dumper=Dumper, sort_keys=False)
+    return dump_yaml({"motors": {"joints": joints, "delay": delay}, "domain_rand": drawn})
 
 
 if __name__ == "__main__":

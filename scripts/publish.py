@@ -15,15 +15,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from legged_torque import resource_path
 from legged_torque.deploy.description import DESCRIPTION_FILE, NETWORK_FILE, read
 from legged_torque.utils import cli
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, printable
 from legged_torque.utils.files import part_of, portable_path, without_machine, write_errors, write_whole
-from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.plain_yaml import dump_yaml
 from legged_torque.utils.policies import CARD, read_card, sha256, upload
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
@@ -125,8 +123,7 @@ def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dic
         from legged_torque.learning import checkpoint
 
         settings = portable_settings(load_config(run))
-        text = yaml.dump(settings, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
-        write_whole(folder / CONFIG_FILE, text)
+        write_whole(folder / CONFIG_FILE, dump_yaml(settings, explicit_start=True, explicit_end=True))
         checkpoint.write_actor(run / training["checkpoint"], folder)
         card["trained"] = settings["command"]
     return card
@@ -152,7 +149,7 @@ def write_cards(folder: Path, card: dict[str, Any]) -> None:
     write_whole(folder / "README.md", text)
     described = (NETWORK_FILE, DESCRIPTION_FILE, CONFIG_FILE, *(file.name for file in folder.glob("model_*.pt")))
     card["files"] = {name: sha256(folder / name) for name in sorted(described) if (folder / name).is_file()}
-    write_whole(folder / CARD, yaml.dump(card, Dumper=Dumper, sort_keys=False, width=100))
+    write_whole(folder / CARD, dump_yaml(card, width=100))
 
 
 if __name__ == "__main__":

@@ -82,10 +82,10 @@ def main() -> None:
     if args.motors:
         cfg = task_registry.get_cfgs(policy.description["task"])[0]
         cfg.motors.restore(policy.description.get("motors", {}))
-        sets_delay = choose_motors(cfg, args.motors)
+        delay = choose_motors(cfg, args.motors)
         policy.description["motors"] = cfg.motors.describe()
-        if sets_delay:
-            policy.description.setdefault("latency", {})["actions"] = cfg.motors.delay.described()
+        if delay:
+            policy.description.setdefault("latency", {})["actions"] = getattr(cfg.motors, delay).described()
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])

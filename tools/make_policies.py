@@ -11,15 +11,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import yaml
-
 from legged_torque import SCRIPTS_DIR
 from legged_torque.learning import checkpoint
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import check_names
 from legged_torque.utils.files import write_whole
-from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.plain_yaml import dump_yaml
 from legged_torque.utils.policies import CARD, POLICIES_DIR, sha256
 from legged_torque.utils.runs import CONFIG_FILE, find_checkpoint, find_run, load_config
 
@@ -90,7 +88,7 @@ def pack(trained: Path, name: str) -> None:
         "license": "BSD-3-Clause",
         "files": {path.name: sha256(path) for path in sorted(folder.iterdir())},
     }  # fmt: skip
-    write_whole(folder / CARD, yaml.dump(card, Dumper=Dumper, sort_keys=False, width=100))
+    write_whole(folder / CARD, dump_yaml(card, width=100))
 
 
 def measure(folder: Path, *words: str) -> dict:

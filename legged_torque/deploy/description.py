@@ -1,19 +1,16 @@
 """Reading, checking and writing ``policy.yaml``, the description of how to run a policy; its network holds it, too."""
 
 import hashlib
-import importlib.util
 import json
 import math
 from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from legged_torque.motors.model_config import MODELS
-from legged_torque.utils.errors import UserError, check_names, refuse
+from legged_torque.utils.errors import UserError, check_names, refuse, require
 from legged_torque.utils.limits import LARGEST
-from legged_torque.utils.plain_yaml import Dumper, parse_yaml
+from legged_torque.utils.plain_yaml import dump_yaml, parse_yaml
 from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names
 
 DESCRIPTION_FILE = "policy.yaml"
@@ -69,7 +66,7 @@ def to_yaml(description: dict[str, Any]) -> str:
     for key, value in description.items():
         comment = SCHEMA["properties"][key].get("description", "").splitlines()
         flow = None if isinstance(value, (dict, list)) else False  # plain values on one line
-        text = yaml.dump({key: value}, Dumper=Dumper, sort_keys=False, width=100, default_flow_style=flow)
+        text = dump_yaml({key: value}, width=100, default_flow_style=flow)
         parts.append("".join(f"# {line}\n" for line in comment) + text)
     return "\n".join(parts)
 
@@ -156,13 +153,6 @@ def _check_schema(description: Any, where: str) -> None:
             raise UserError(f"{where}: {path} is not a finite number, at most {LARGEST:g} either way")
         message = " ".join(error.message.split())
         raise UserError(f"{where}: {path}: {message if len(message) < 160 else '... ' + message[-150:]}")
-
-
-def require(*packages: str, extra: str = "export") -> None:
-    """Raise a UserError that names the extra if a package is not installed."""
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")
 
 
 def holds_gains(description: dict[str, Any]) -> bool:

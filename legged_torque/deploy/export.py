@@ -21,7 +21,6 @@ from legged_torque.deploy.description import (
     check,
     columns,
     metadata,
-    require,
     to_yaml,
 )
 from legged_torque.deploy.policy import (
@@ -40,7 +39,7 @@ from legged_torque.motors.motor import Motor
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
-from legged_torque.utils.errors import UserError, refuse
+from legged_torque.utils.errors import UserError, refuse, require
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.policies import sha256
 from legged_torque.utils.runs import package_versions

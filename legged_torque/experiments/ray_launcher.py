@@ -12,7 +12,7 @@ from legged_torque.experiments.local_launcher import GPU_JOBS, Jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
 from legged_torque.experiments.ray_node import Files, NodeStep, Report, is_checkpoint, versions_here, write_files
 from legged_torque.learning.worlds import remove_older_worlds, worlds_file
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.limits import check_value
 from legged_torque.utils.runs import CONFIG_FILE, PRETRAINED
 
@@ -121,10 +121,9 @@ class RayProcess:
 
 def join_cluster(address: str) -> Any:
     """Join the cluster at an address, "auto" or HOST:PORT, and return the package ray; see :class:`RayLauncher`."""
-    try:
-        import ray
-    except ImportError:
-        raise UserError("--launcher ray needs the extra: pip install 'legged_torque[ray]'") from None
+    require("ray", extra="ray")
+    import ray
+
     host, _, port = address.rpartition(":")
     if address != "auto" and not (host and port.isdecimal()):
         raise UserError(f"--address must be auto or HOST:PORT, not '{address}'")

@@ -110,6 +110,9 @@ def find_legs(source: Source, shapes: dict[int, list[Shape]]) -> list[Leg]:
     legs = [chain for chain, low in zip(chains, lows, strict=True) if low < LOW * min(lows)]
     if not legs:
         raise UserError(f"cannot import '{source.file}': no leg reaches below its trunk's origin; z must point upwards")
+    uses = Counter(body for chain in legs for body in chain)
+    if shared := ", ".join(f"'{model.body(body).name}'" for body, count in uses.items() if count > 1):
+        raise UserError(f"cannot import '{source.file}': its legs must not branch, or share bodies: {shared}")
     names, found = _leg_names(source, legs, data), []
     for name, chain in zip(names, legs, strict=True):
         foot = _wheel(model, shapes, chain[-1])

@@ -8,6 +8,7 @@ import numpy as np
 
 from legged_torque.importer.legs import FOOT
 from legged_torque.importer.robot import Robot
+from legged_torque.importer.source import balanced
 from legged_torque.utils.mjcf import loading
 
 SCENE = Path(__file__).with_name("scene.xml")  # everything but the robot's own parts
@@ -15,7 +16,6 @@ COMMENT = """{name}: written by scripts/import_robot.py. Its geoms touch the flo
      Source: {file}
      Changes:
 {notes}"""
-DIGITS = 1e-5  # share of the largest moment of inertia by which six digits may break A + B >= C
 DISTANCE, ELEVATION = 2.5, 1.0  # of the camera along x and -y, and over the trunk; in heights of the trunk
 
 
@@ -51,7 +51,7 @@ def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
         )
     for number, body in bodies.items():
         body.name = model.body(number).name or robot.shapes[number][0].name
-        body.mass, body.inertia = model.body_mass[number], _writable(model.body_inertia[number])
+        body.mass, body.inertia = model.body_mass[number], balanced(model.body_inertia[number])
         body.ipos, body.iquat, body.explicitinertial = model.body_ipos[number], model.body_iquat[number], True
         for shape in robot.shapes[number]:
             default = spec.find_default("foot" if shape.name.endswith(FOOT) else "main")
@@ -70,10 +70,3 @@ def mjcf(robot: Robot) -> tuple[str, mujoco.MjModel]:
     text = f"<!-- {re.sub('-(?=-)', '- ', comment)} -->\n{spec.to_xml()}"  # XML forbids two dashes in a comment
     with loading(robot.source.file):
         return text, mujoco.MjModel.from_xml_string(text)
-
-
-def _writable(moments: np.ndarray) -> np.ndarray:
-    """Return moments of inertia of which A + B >= C holds in six digits, the two smaller ones raised if need be."""
-    order, raised = np.argsort(moments), moments.copy()
-    raised[order[:2]] += 0.5 * max(0.0, (2.0 + DIGITS) * moments[order[2]] - moments.sum())
-    return raised

@@ -131,10 +131,8 @@ def _nominal_pose(source: Source, legs: list[Leg], shapes: dict[int, list[Shape]
             data = zero_pose(model, angles - holding / stiffness)  # under its weight
             feet = [lowest_point(data, leg.bodies[-1], leg.foot)[0] for leg in legs]
             ahead += float(data.subtree_com[1][0] - np.mean(feet))
-        share = CROUCH[legs[0].has_sole]
-        source.notes.append(
-            f"nominal pose: inverse kinematics, feet below the center of mass, legs {share:.0%} stretched"
-        )
+        stretched = f"legs {CROUCH[legs[0].has_sole]:.0%} stretched"
+        source.notes.append(f"nominal pose: inverse kinematics, feet below the center of mass, {stretched}")
         far = (f"{name} by {miss:.2f} m" for name, miss in missed.items() if miss > MISSED)
         source.notes.on(far, "within the limits of joints, feet do not get there")
     outside = (angles < ranges[:, 0]) | (angles > ranges[:, 1])

@@ -19,7 +19,7 @@ COLLISION_GROUP = 3  # of Menagerie's collision geoms, also of those that one of
 TINY = 1e-6  # inertia and mass up to which a fixed link has none; MuJoCo refuses less [kg m^2], [kg]
 GRAVITY = 9.81  # of all robots; that of the file does not count [m/s^2]
 HEAVIEST = 1e4  # mass of a robot that is none [kg]
-ROUNDING = 1e-6  # by which raised inertias exceed what they have to be, as a share
+DIGITS = 1e-5  # share of the largest moment of inertia by which six digits may break A + B >= C
 NAME = re.compile(r"[A-Za-z0-9_.:/-]*")  # names of bodies and joints, which become parts of settings and of a MJCF
 SITE = "link:"  # prefix of the names of sites in the places of fixed links
 PARENTS = 4  # folders above that of the file in which meshes are looked for
@@ -132,8 +132,8 @@ def _prepare_urdf(root: ET.Element, what: str) -> None:
         limit = joint.find("limit")
         if limit is not None and limit.attrib.keys() & {"lower", "upper"}:
             low, high = limit.attrib.setdefault("lower", "0"), limit.attrib.setdefault("upper", "0")
-            if float(low) > float(high):
-                raise UserError(f"{what}: the range of '{joint.get('name')}' must be in order, not {low} to {high}")
+            if float(low) >= float(high):  # MuJoCo would take equal ones for none
+                raise UserError(f"{what}: '{joint.get('name')}' must be fixed or have lower < upper, not {low}, {high}")
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
@@ -233,18 +233,23 @@ def _balance(body: mujoco.MjsBody, notes: Notes) -> None:
         axes, moments = rotation(body.iquat), np.array(body.inertia)
     else:
         moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    order = np.argsort(moments)
-    missing = 2.0 * moments[order[2]] - moments.sum()
-    if moments[order[0]] <= 0.0 or missing <= 0.0:
+    missing = 2.0 * moments.max() - moments.sum()
+    if moments.min() <= 0.0 or missing <= 0.0:
         return
-    moments[order[:2]] += missing / 2.0 + ROUNDING * moments[order[2]]
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = axes @ np.diag(moments) @ axes.T
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = axes @ np.diag(balanced(moments)) @ axes.T
     body.fullinertia, body.inertia = [xx, yy, zz, xy, xz, yz], np.zeros(3)
     body.iquat = [1.0, 0.0, 0.0, 0.0]
     notes.append(
-        f"the inertia of '{body.name}' broke A + B >= C by {missing:.2g} kg m^2, {missing / moments[order[2]]:.1%} of "
+        f"the inertia of '{body.name}' broke A + B >= C by {missing:.2g} kg m^2, {missing / moments.max():.1%} of "
         "the largest moment: the two smaller ones are raised by half of that each"
     )
+
+
+def balanced(moments: np.ndarray) -> np.ndarray:
+    """Return moments of inertia of which A + B >= C holds in six digits, the two smaller ones raised if need be."""
+    order, raised = np.argsort(moments), moments.copy()
+    raised[order[:2]] += 0.5 * max(0.0, (2.0 + DIGITS) * moments[order[2]] - moments.sum())
+    return raised
 
 
 def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
@@ -334,5 +339,6 @@ def _note_left_out(model: mujoco.MjModel, notes: Notes) -> None:
         "density, viscosity and wind": (model.opt.density, model.opt.viscosity, model.opt.wind),
         "the dynamics of actuators (filters, activations)": [model.actuator_dyntype],
         "the delays of actuators": [getattr(model, "actuator_delay", 0.0)],
+        "geoms of the world, such as floors": [model.geom_bodyid == 0],
     }
     notes += [f"left out: {what}" for what, values in found.items() if any(np.any(value) for value in values)]

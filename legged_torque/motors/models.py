@@ -1,7 +1,7 @@
 """Motor models in torch and as kernels; their formulas are in :mod:`legged_torque.motors.formulas`."""
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast, get_args
 
 import torch
 import warp as wp
@@ -13,6 +13,7 @@ from legged_torque.motors.model_config import ModelCfg
 from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Limits, types_of
 
 _SMALL = wp.constant(SMALL)
 
@@ -266,11 +267,13 @@ class ModelMotor(Motor):
     def random_parameters(self) -> list[RandomParameter]:
         """Return what ``draws`` names, each as one number per world."""
         link, columns = self.joints.section.removeprefix("motors."), range(len(self.joints.names))
-        draws: dict[str, Any] = self.cfg.draws
-        return [
-            RandomParameter(f"{link}_{name}", getattr(self.values, name), columns, draw, shared=True, at_least=0.0)
-            for name, draw in draws.items()
-        ]
+        types, draws = types_of(cast(type, type(self.cfg))), cast(dict[str, Any], self.cfg.draws)
+        drawn = []
+        for name, draw in draws.items():
+            bounds = next((part for part in get_args(types.get(name)) if isinstance(part, Limits)), Limits())
+            values = getattr(self.values, name)
+            drawn.append(RandomParameter(f"{link}_{name}", values, columns, draw, shared=True, bounds=bounds))
+        return drawn
 
 
 class NetworkModel(ModelMotor):

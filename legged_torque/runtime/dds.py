@@ -72,12 +72,10 @@ class _Side:
 
         A UserError if there is no such network interface, or DDS cannot use it or the domain.
         """
-        names = [name for _, name in socket.if_nameindex()]
-        check_names("network interface", [interface], names)
+        check_names("network interface", [interface], [name for _, name in socket.if_nameindex()])
         try:
             self._domain = Domain(domain, configuration(interface))
-            self._participant = DomainParticipant(domain)
-            here = self._participant
+            here = self._participant = DomainParticipant(domain)
             topics = {kind: Topic(here, TOPICS[kind], kind) for kind in (*self.writes, *self.reads)}
             self._writer, self._service_writer = (DataWriter(here, topics[kind], WRITER) for kind in self.writes)
             self._reader, self._service_reader = (DataReader(here, topics[kind], READER) for kind in self.reads)

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from legged_torque.deploy.description import NETWORK_FILE, holds_gains, laws_of_motors, not_understood, read, require
+from legged_torque.deploy.description import NETWORK_FILE, holds_gains, laws_of_motors, not_understood, read
 from legged_torque.runtime.interface import JOINT_ORDER
-from legged_torque.utils.errors import refuse
-from legged_torque.utils.plain_yaml import Dumper
+from legged_torque.utils.errors import refuse, require
+from legged_torque.utils.plain_yaml import dump_yaml
 
 UNITREE = {"angular_velocity": "base_ang_vel", "projected_gravity": "projected_gravity", "command": "velocity_commands"}
 UNITREE |= {"joint_position": "joint_pos_rel", "joint_velocity": "joint_vel_rel", "last_action": "last_action"}
@@ -68,7 +67,7 @@ def write_deploy_yaml(folder: Path) -> None:
     for name in ("exported", "params"):
         (folder / name).mkdir()
     onnx.save(model, folder / "exported" / NETWORK_FILE)
-    text = yaml.dump(content, Dumper=Dumper, sort_keys=False, width=120, default_flow_style=None)
+    text = dump_yaml(content, width=120, default_flow_style=None)
     (folder / "params" / "deploy.yaml").write_text(text, encoding="utf-8")
 
 

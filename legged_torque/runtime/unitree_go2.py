@@ -189,8 +189,7 @@ def _check(message: Message, motors: str) -> None:
     if head != HEAD:
         raise MessageError(f"the head is {bytes(head).hex()}, not {bytes(HEAD).hex()}: another protocol")
     modes = zip(JOINT_ORDER, message[f"{motors}.mode"], strict=True)
-    wrong = [f"{joint} {mode}" for joint, mode in modes if mode != SERVO]
-    if wrong:
+    if wrong := [f"{joint} {mode}" for joint, mode in modes if mode != SERVO]:
         raise MessageError(f"motors are not in mode {SERVO}: {', '.join(wrong)}")
 
 

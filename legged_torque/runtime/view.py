@@ -35,10 +35,14 @@ class View:
         self._session, self._loop, self._operators = session, loop, operators
         console = Console(emoji=False)  # loading emoji takes 12 ms without a tick
         self.live = Live(console=console, auto_refresh=False) if is_terminal(sys.stdout) else contextlib.nullcontext()
+        self._identity = [0] * 4  # the last that was shown, or that of robots that do not tell theirs
         self._due, self._counted, self._rates = 0.0, np.array([time.monotonic(), 0, 0]), np.zeros(2)
 
     def show(self) -> None:
-        """Draw the table, or print the line, if it is time for the next one."""
+        """Say which robot it is, once; draw the table, or print the line, if it is time for the next one."""
+        if (state := self._session.controller.state) and (identity := state.identity.tolist()) != self._identity:
+            self._identity = identity
+            print(f"the robot's firmware is {identity[:2]}, its serial number {identity[2:]}", flush=True)
         if (now := time.monotonic()) < self._due:
             return
         counted = np.array([now, self._loop.ticks, self._session.counts["messages"]])
@@ -57,8 +61,7 @@ class View:
         parts = [controller.mode.value + (f" ({controller.reason})" if controller.reason else "")]
         parts.append("command " + " ".join(f"{part:+.2f}" for part in controller.velocity_command))
         if state is not None:
-            _, share = self._torques(state)
-            worst = int(np.argmax(share))
+            worst = int(np.argmax(share := self._torques(state)[1]))
             parts.append(f"torque {share[worst]:.0%} of {controller.joints.names[worst]}'s limit")
             parts.append(f"motors {state.temperatures.max():.0f} deg C; tilt {tilt_of(state.quaternion):.2f} rad")
         late = 1e3 * self._loop.lateness(0.999)

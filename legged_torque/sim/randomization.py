@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legged_torque.sim import kernels
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.limits import Draw, check_value
+from legged_torque.utils.limits import Draw, Limits, check_value
 from legged_torque.utils.mirroring import Mirroring
 
 
@@ -41,7 +41,7 @@ class RandomParameter:
     same_draw_as: str | None = None  # name of an earlier parameter whose draws it takes
     may_keep: bool = False  # whether it keeps its own value in a share of the draws
     limits: tuple[Sequence[float], Sequence[float]] | None = None  # lowest and highest, per column, to clip draws to
-    at_least: float = -math.inf  # what no draw may be below, in the sign of the ranges
+    bounds: Limits = dataclasses.field(default_factory=Limits)  # what no draw may leave, in the sign of the ranges
     at_reset_only: bool = False  # whether it is drawn at resets only
     mirror: Mirroring | None = None  # of the numbers listed; None: one number is its own image, several are unknown
 
@@ -82,7 +82,7 @@ class Randomization:
 
         ``model_field`` returns a field of the model to change some columns, see :meth:`Engine.field`. Parameters that
         may keep their own values do so in a share of draws, ``keep_probability``. A UserError if a parameter is not
-        float32, has not two axes, or can fall below what it may be.
+        float32, has not two axes, or can leave its bounds.
         """
         self.parameters, self.fields = list(parameters), dict[str, Tensor]()
         self.sizes: dict[str, int] = {}
@@ -168,7 +168,7 @@ def fixed(parameter: RandomParameter) -> RandomParameter:
 
 
 def table(parameter: RandomParameter, field: Tensor, keep_probability: float) -> list[Any]:
-    """Return how each column of a parameter is drawn; a UserError if it can fall below what it may be."""
+    """Return how each column of a parameter is drawn; a UserError if it can leave its bounds."""
     at_start = field[0, list(parameter.columns)].tolist()
     own, unit = at_start if parameter.own is None else parameter.own, parameter.add_unit
     if "set" in parameter.draw:
@@ -188,12 +188,12 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
         row.column_low, row.column_span = of_column[0], of_column[1] - of_column[0]
         row.keep_probability = keep_probability if parameter.may_keep else 0.0
         corners = [(base + weight * add) * factor * other for add, factor, other in product(offset, scale, of_column)]
-        lowest_draw = min(math.copysign(1.0, weight) * corner for corner in corners)
-        if lowest_draw < parameter.at_least:
-            raise UserError(
-                f"random parameter '{parameter.name}' can be {lowest_draw:g} with the ranges given; it must be at "
-                f"least {parameter.at_least:g}"
-            )
+        for extreme in sorted(math.copysign(1.0, weight) * float(np.float32(corner)) for corner in corners):
+            if not parameter.bounds.allow(extreme):
+                raise UserError(
+                    f"random parameter '{parameter.name}' can be {extreme:g} with the ranges given; it must be "
+                    f"{parameter.bounds}"
+                )
         half_range = (max(corners) - min(corners)) / 2
         row.middle = (max(corners) + min(corners)) / 2
         row.per_half_range = 1.0 / half_range if half_range > 0.0 else 0.0

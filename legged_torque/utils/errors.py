@@ -2,6 +2,7 @@
 
 import contextlib
 import difflib
+import importlib.util
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
 OUT_OF_MEMORY = ("out of memory", "Failed to allocate", "can't allocate memory")
@@ -34,6 +35,13 @@ class UserError(Exception):
 
 class TrainingError(Exception):
     """A training that cannot learn: one line that says why. Scripts print it and exit with status 1."""
+
+
+def require(*packages: str, extra: str = "export") -> None:
+    """Raise a UserError that names the extra if a package is not installed."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise UserError(f"{package} is not installed; this needs the extra: pip install 'legged_torque[{extra}]'")
 
 
 def unknown_name(kind: str, given: str, allowed: Iterable[str]) -> UserError:

@@ -145,10 +145,8 @@ def robot_notes(file: Path, trained: Path) -> Iterator[str]:
         with loading(each):
             models.append(read_spec(each).compile())
     ours, theirs = ({m.joint(i).name: axis for i, axis in enumerate(joint_axes(m))} for m in models)
-    turned = [name for name, axis in theirs.items() if name in ours and axis @ ours[name] < 0.999]
-    if turned:
-        names = ", ".join(turned)
-        yield f"asset.file has other axes than the robot of the training: {names} are seen and driven wrongly"
+    if turned := ", ".join(name for name, axis in theirs.items() if name in ours and axis @ ours[name] < 0.999):
+        yield f"asset.file has other axes than the robot of the training: {turned} are seen and driven wrongly"
     masses = [float(model.body_mass.sum()) for model in models]
     if abs(masses[0] - masses[1]) > 1e-3 * masses[1]:
         yield f"asset.file has {masses[0]:.3f} kg, the robot of the training {masses[1]:.3f} kg"

@@ -121,15 +121,15 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     train_cfg.refuse_unread(path for path, _ in changes)
 
 
-def choose_motors(env_cfg: Any, name: str) -> bool:
+def choose_motors(env_cfg: Any, name: str) -> str:
     """Choose a chain of motors by its name, or take settings of motors and of what is drawn at random from a YAML file.
 
-    Returns whether a file has set when commands come, ``motors.delay``. A UserError if there is no such chain or file,
-    or the file holds anything else.
+    Returns the delay that a file has set, by the name of its link, that of the chain first; empty without one. A
+    UserError if there is no such chain or file, or the file holds anything else.
     """
     if not name.endswith(MOTOR_FILES):
         env_cfg.motors.choose(name)
-        return False
+        return ""
     try:
         values = parse_yaml(Path(name).read_text("utf-8"), f"'{name}'")
     except (OSError, UnicodeDecodeError) as error:
@@ -138,7 +138,9 @@ def choose_motors(env_cfg: Any, name: str) -> bool:
         raise UserError(f"'{name}' must hold the sections {' and '.join(OF_MOTORS)}")
     check_names(f"section of '{name}'", values, OF_MOTORS)
     update_from_dict(env_cfg, values)
-    return "delay" in values.get("motors", {})
+    links, given = env_cfg.motors, values.get("motors", {})
+    known = (name for name in (*links.chain, *given) if name in given)
+    return next((name for name in known if hasattr(getattr(links, name), "counted")), "")
 
 
 def law_of_motors(env_cfg: Any) -> dict[str, list[str]]:
@@ -152,9 +154,9 @@ def simulated_latency(env_cfg: Any, motors: str, latency: float | None) -> float
 
     If not, what a file of motors says; a UserError if that is not one time.
     """
-    of_file = choose_motors(env_cfg, motors)
-    if latency is None and of_file:
-        return env_cfg.motors.delay.seconds(f"motors.delay of '{motors}'", env_cfg.sim.dt, env_cfg.control.decimation)
+    if (name := choose_motors(env_cfg, motors)) and latency is None:
+        clock = env_cfg.sim.dt, env_cfg.control.decimation
+        return getattr(env_cfg.motors, name).seconds(f"motors.{name} of '{motors}'", *clock)
     return (latency or 0.0) / 1e3
 
 
@@ -166,18 +168,15 @@ def apply_perturbation(env_cfg: Any, name: str) -> None:
 def draw_only(env_cfg: Any, name: str) -> None:
     """Let a task draw a random parameter, and no other where it draws none; an unknown name is a UserError.
 
-    Motors draw constants of their own where parameters are drawn: those stay as they are, too.
+    Motors and tasks draw parameters of their own where parameters are drawn: those stay as they are, too.
     """
     rand, names = env_cfg.domain_rand, env_cfg.random_parameters()
     check_names("random parameter", [name], [*names, *DELAYS, PUSH])
     if name == PUSH:
         rand.push_robots = False  # the sweep pushes
-    if name in names and not rand.randomize_parameters:
-        rand.randomize_parameters, rand.keep_fixed = True, list(names)
-        for link in (getattr(env_cfg.motors, key, None) for key in env_cfg.motors.chain):
-            if link is not None and hasattr(link, "draws"):
-                link.draws = {}
     freed = CONTACT if name in CONTACT else (name,)
+    if name in names and not rand.randomize_parameters:
+        rand.randomize_parameters, rand.keep_fixed, rand._swept = True, list(names), freed
     rand.keep_fixed = [other for other in rand.keep_fixed if other not in freed]
 
 

@@ -24,6 +24,11 @@ def parse_yaml(text: str, source: str) -> Any:
     raise UserError(f"{source} is nested too deeply or larger than settings are")
 
 
+def dump_yaml(value: Any, **how: Any) -> str:
+    """Return a value as YAML that :func:`parse_yaml` reads the same; ``how`` is for PyYAML."""
+    return yaml.dump(value, Dumper=Dumper, sort_keys=False, **how)
+
+
 def is_small(value: Any) -> bool:
     """Return whether nested lists and dictionaries have at most :data:`MAX_DEPTH` levels of :data:`MAX_ENTRIES` each.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, require, unknown_name
 from legged_torque.utils.files import is_whole_archive
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import CONFIG_FILE, checkpoint_file
@@ -88,10 +88,8 @@ def upload(folder: Path, repository: str) -> str:
 @contextlib.contextmanager
 def _client(package: str, extra: str, failure: str) -> Iterator[Any]:
     """Give a package that is a client of a server; a UserError if it is not installed, or says why something failed."""
-    try:
-        client = importlib.import_module(package)
-    except ImportError:
-        raise UserError(f"{package} is not installed: pip install 'legged_torque[{extra}]'") from None
+    require(package, extra=extra)
+    client = importlib.import_module(package)
     try:
         yield client
     except Exception as error:  # of httpx, OSErrors, ValueErrors, and others if an answer is not what it expects

@@ -14,12 +14,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from legged_torque import __version__
 from legged_torque.utils.errors import UserError, unknown_name
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, write_errors, write_whole
-from legged_torque.utils.plain_yaml import Dumper, parse_yaml
+from legged_torque.utils.plain_yaml import dump_yaml, parse_yaml
 
 CONFIG_FILE = "config.yaml"
 EVALUATIONS_FILE = "evaluations.csv"  # a row per evaluation during training
@@ -150,8 +148,7 @@ def save_config(run_dir: str | Path, config: dict[str, Any]) -> None:
     """Write a run's settings, its command, and the versions of packages, between YAML's marks of a document."""
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
     content = {**config, "command": command, "versions": package_versions()}
-    text = yaml.dump(content, Dumper=Dumper, sort_keys=False, explicit_start=True, explicit_end=True)
-    write_whole(Path(run_dir) / CONFIG_FILE, text.encode())
+    write_whole(Path(run_dir) / CONFIG_FILE, dump_yaml(content, explicit_start=True, explicit_end=True))
 
 
 def load_config(run_dir: Path) -> dict[str, Any]:

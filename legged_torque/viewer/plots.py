@@ -12,7 +12,7 @@ from legged_torque.envs.base.asset import Asset
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.mjcf import joint_limits
 from legged_torque.viewer.session import HISTORY_STEPS, Session
-from legged_torque.viewer.snapshot import Snapshot
+from legged_torque.viewer.snapshot import PD_CONTROL, Snapshot
 
 Series = Iterable[tuple[str, str]]  # names and colors
 Row = tuple[str, str, Sequence[str]]  # name, color of its dot or nothing, and texts
@@ -42,7 +42,7 @@ class Plots:
         self._angle_limits = joint_limits(task.sim.mj_model)[1:].T
         self._feet, self._terms = foot_labels(task.asset), task.reward_names
         self._parts = list(zip((name.replace("_", " ") for name in session.mixing), cycle(PARTS), strict=False))
-        self._has_targets = any(term.name == "position_residual" for term in task.control_law.terms)
+        self._has_targets = any(term.name == PD_CONTROL for term in task.control_law.terms)
         seconds, panel = HISTORY_STEPS * task.dt, gui.add_panel()
         with panel.add_tab("Walking", viser.Icon.ACTIVITY):
             self._lines = [("commanded", COMMAND), ("actual", ACTUAL), ("companion", COMPANION)]

@@ -176,7 +176,7 @@ class Session:
         """Give all worlds a command, or those of the training, from the next step on."""
         self.command = command
         self.task.command_generator.hold(command or self.task.cfg.commands.fixed)
-        self.task.command_generator.resample(torch.ones_like(self.task.reset_buf))
+        self.task.command_generator.update()
 
     def _apply_mixing(self) -> None:
         """Set the chosen weights, or those of the curriculum. They stay, since only rollouts change them."""

@@ -7,13 +7,12 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils.display import warn
 from legged_torque.utils.distributed import ending_with_parent
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.runs import checkpoint_number
 
 EXTRAS = {"viewer": ("viser", "trimesh"), "video": ("imageio", "imageio_ffmpeg", "PIL")}
@@ -35,10 +34,8 @@ class TrainingViewer:
     def __init__(self, has_page: bool, video_interval: int) -> None:
         """Prepare; ``video_interval`` is in iterations, 0 for no videos. A UserError if an extra is missing."""
         for extra, is_wanted in (("viewer", has_page), ("video", video_interval > 0)):
-            missing = [name for name in EXTRAS[extra] if is_wanted and not find_spec(name)]
-            if missing:
-                lacking = f"{', '.join(missing)} is missing"
-                raise UserError(f"this needs the extra: pip install 'legged_torque[{extra}]' ({lacking})")
+            if is_wanted:
+                require(*EXTRAS[extra], extra=extra)
         self._port = free_port(HOST, PORT) if has_page else 0
         self.page = f"http://{HOST}:{self._port}" if has_page else ""
         self._video_interval, self._next_video = video_interval, 0

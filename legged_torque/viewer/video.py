@@ -16,7 +16,7 @@ from legged_torque.deploy.simulation import Simulation
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.devices import INSTALL_HINT
 from legged_torque.utils.display import Counter
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.files import write_whole
 from legged_torque.viewer.drawing import Camera, Drawing, Ground, drawn_model
 
@@ -73,12 +73,9 @@ class VideoRecorder:
         """
         if no_renderer or not self.steps:
             raise UserError(no_renderer or "nothing has moved")
-        try:
-            import imageio
-            import imageio_ffmpeg  # noqa: F401
-            import PIL  # noqa: F401
-        except ImportError:
-            raise UserError("videos need the extra: pip install 'legged_torque[video]'") from None
+        require("imageio", "imageio_ffmpeg", "PIL", extra="video")
+        import imageio
+
         side = math.isqrt(len(self.steps[0][0]))
         width, height = SIZE if side == 1 else (length // side // 2 * 2 for length in GRID_SIZE)  # even, for mp4
         drawing, model = self.drawing, self.drawing.model

@@ -14,6 +14,8 @@ from legged_torque.deploy.latency import Latency
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Simulation
+from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot, task_registry
+from legged_torque.motors.config import DelayCfg
 
 
 def test_constant_delays(make_task, tmp_path):
@@ -45,11 +47,25 @@ def test_constant_delays(make_task, tmp_path):
         np.testing.assert_allclose(applied, expected, rtol=1e-6)
 
 
-def test_delay_of_a_file_of_motors(make_task, tmp_path):
-    """sim2sim.py takes it in place of the export's, also if it is 0."""
+class BusCfg(A1TorqueCfg):
+    """An A1 whose delay has a name of its own."""
+
+    class motors:
+        chain = ["bus", "ideal"]
+
+        class bus(DelayCfg):
+            pass
+
+
+@pytest.mark.parametrize("link", ["delay", "bus"])
+def test_delay_of_a_file_of_motors(make_task, tmp_path, monkeypatch, link):
+    """sim2sim.py takes it in place of the export's, also if it is 0, or has another name."""
+    monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
+    task_registry.register("a1_bus", TorqueRobot, BusCfg(), A1TorqueCfgPPO())
     for name, delay in (("late", [4, 4]), ("ideal", [0, 0])):
-        export_random(make_task, "a1_torque", tmp_path / name, **{"motors.delay.range": delay})
-        (tmp_path / f"{name}.yaml").write_text(f"motors: {{delay: {{range: {delay}}}}}")
+        task = "a1_bus" if link == "bus" else "a1_torque"
+        export_random(make_task, task, tmp_path / name, **{f"motors.{link}.range": delay})
+        (tmp_path / f"{name}.yaml").write_text(f"motors: {{{link}: {{range: {delay}}}}}")
     found = {}
     for name, motors in product(("late", "ideal"), (None, "late.yaml", "ideal.yaml")):
         words = [name, "--robots=1", "--steps=20", "--json=out.json", *([f"--motors={motors}"] if motors else [])]

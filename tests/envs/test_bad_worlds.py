@@ -186,11 +186,14 @@ def test_divergence_during_the_physics(make_task):
 
 
 class DividingRobot(TorqueCurriculumRobot):
-    """A robot whose reward or observation divides by zero in some worlds."""
+    """A robot whose reward or observation divides by zero in some worlds, and which keeps tensors of its own."""
 
     def _init_buffers(self):
         """Add the divisors."""
         super()._init_buffers()
+        self.mean = self.keep("mean", torch.full((self.num_envs,), 0.5))
+        self.nearest = self.keep("nearest", torch.full((self.num_envs, 2), math.inf))
+        self.count = self.keep("count", torch.full((self.num_envs,), -1))  # NaN, if it was read as a float
         self.reward_divisor, self.observation_divisor = torch.ones(2, self.num_envs, 1).unbind()
 
     def _reward_ratio(self):
@@ -261,6 +264,16 @@ def test_reward_that_divides_by_zero(make_dividing):
     *_, rewards, dones, _ = steps(task, 1)[0]
     assert not dones[1] and rewards[1] > 0.0 and reported(task) == {}
     assert task.episode_return[1] == rewards[1] and task.episode_length_buf[1] == 1
+
+
+def test_a_tensor_of_ones_own(make_dividing):
+    """What a task keeps is reported and mended once, but for integers and for what is infinite from the start."""
+    task = make_dividing(WORLDS)
+    task.mean[1] = math.nan
+    results = steps(task, 2)
+    assert [result[3].tolist() for result in results] == [[False, True, False], [False] * 3]
+    assert reported(task) == {"buffer 'mean'": 1} and task.mean.tolist() == [0.5] * 3
+    assert task.nearest.isinf().all() and (task.count == -1).all()
 
 
 def test_bad_reward_is_no_time_out(make_dividing):

@@ -91,6 +91,8 @@ def test_ranges_grow(make_task, monkeypatch, tracking, shares):
     assert fewer.curriculum_values()["command_ranges"] == task.curriculum_values()["command_ranges"]
     assert other.curriculum_values()["command_ranges"] == task.curriculum_values()["command_ranges"]
     assert not evaluation_cfg(task.cfg, 2).commands.curriculum
+    fixed = {"commands.fixed": [0.0, 0.0, 0.0]}
+    assert "curriculum has no effect with commands.fixed" in error_of(make_task, "a1_torque", 1, **changes, **fixed)
 
 
 def test_a_generator_of_ones_own(tmp_path, make_task, monkeypatch):

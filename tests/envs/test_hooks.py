@@ -63,12 +63,24 @@ def test_methods_of_ones_own():
             return self.count
 
         def swing_height(self):
+            return [scale * self._reward_swing() for scale in self.action_term()]
+
+        def action_term(self):
+            return [1.0]
+
+        def _reward_swing(self):
             return self.count
 
     task = Counting(small())
     for step in range(1, 4):
         task.step(torch.zeros(2, 12))
-        assert task._reward_alive().tolist() == [step, step]
+        assert task._reward_alive().tolist() == task.swing_height()[0].tolist() == [step, step]
+
+
+def test_a_misspelt_hook_that_only_calls_itself():
+    """Asking a base class for its own name makes it no helper."""
+    line = error_of(robot(action_term=lambda self: self.action_term()), small())
+    assert "Port.action_term is never called; did you mean 'action_terms'?" in line
 
 
 @pytest.mark.parametrize("name", ["reset_buf", "commands", "obs_buf", "rew_buf", "count"])

@@ -11,22 +11,34 @@ from support.scripts import SMALL, assert_told_in_one_line, run_here
 from support.settings import error_of
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.metrics import measure
 from legged_torque.envs.base.sweep import NUM_PARTS, REST, WATCHED, PushSweep, Sweep
+from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import CONTACT, PUSH, draw_only
 
 QUICK = {"domain_rand.resampling_probability": 0.2, "env.episode_length_s": 0.3, "commands.resampling_probability": 0.0}
 
 
-def swept(make_task, name, **settings):
+class Payload(LeggedRobot):
+    """A robot with a parameter whose ranges are no settings."""
+
+    def random_parameters(self):
+        """Add it."""
+        return [*super().random_parameters(), RandomParameter("payload", "body_mass", [2], {"scale": [0.5, 2.0]})]
+
+
+def swept(name, **settings):
     """Worlds that draw one parameter often."""
     cfg = task_registry.get_cfgs("a1_position")[0]
     cfg.motors.chain = cfg.motors.choices["real"]  # whose voltage is drawn in training
     draw_only(cfg, name)
-    settings |= {"motors.chain": cfg.motors.chain, "motors.urdf.draws": cfg.motors.urdf.draws}
-    rand = {f"domain_rand.{key}": getattr(cfg.domain_rand, key) for key in ("randomize_parameters", "keep_fixed")}
-    return make_task("a1_position", 12, **QUICK, **rand, **settings)
+    for path, value in {"env.num_envs": 12, **QUICK, **settings}.items():
+        set_by_path(cfg, path, value)
+    torch.manual_seed(1)
+    return Payload(cfg)
 
 
 def shaking(task):
@@ -44,9 +56,9 @@ def shaking(task):
         ("action_delay", {"motors.delay.range": [0, 15], "motors.delay.unit": "milliseconds"}, (0, 4), "delay"),
     ],
 )
-def test_parts(make_task, name, setting, ends, tensor):
+def test_parts(name, setting, ends, tensor):
     """Mean speed and number of steps of each part are those of the steps in which worlds had such values."""
-    task = swept(make_task, name, **setting)
+    task = swept(name, **setting)
     parameters, others = task.events.parameters, task.cfg.domain_rand.randomize_parameters  # not for a delay
     assert not any(others and np.ptp(parameters.range_of(each)[1:]) for each in parameters.sizes if each != name)
     values = {
@@ -94,7 +106,7 @@ def test_a_parameter_that_is_kept(make_task):
 def test_both_numbers_of_contacts(changed, make_task):
     """They are drawn together: one beside the file's would be of another format."""
     file = changed(setting(".//geom[@solref]", solref="0.02 1"))
-    task = swept(make_task, "contact_stiffness", **{"asset.file": file})
+    task = swept("contact_stiffness", **{"asset.file": file})
     stiffness, damping = -task.sim.field("geom_solref")[:, 0].T
     torch.testing.assert_close(damping, 72.0 + (stiffness - 900.0) * 0.08)
     assert Sweep(task, "contact_stiffness").edges[0] == 900.0
@@ -146,9 +158,9 @@ def test_pushes(make_task):
         ("contact_damping", {}, "contact_damping has no draw of its own, but that of contact_stiffness: sweep"),
     ],
 )
-def test_what_cannot_be_split(make_task, name, settings, message):
+def test_what_cannot_be_split(name, settings, message):
     """One value, or numbers for each foot."""
-    task = swept(make_task, name, **settings)
+    task = swept(name, **settings)
     with pytest.raises(UserError, match=message):
         Sweep(task, name)
 

@@ -58,6 +58,27 @@ def test_a_name_is_kept_once(make_task):
     assert task.world_state_dict()["task"]["phase"] is phase
 
 
+def test_actions_of_another_shape(make_task):
+    """They are refused, also those that torch would repeat in all worlds."""
+    task = make_task("a1_torque", 2)
+    for shape in ((12,), (1, 12), (2, 1), (3, 12)):
+        assert f"must have the shape (2, 12), not {shape}" in error_of(task.step, torch.zeros(shape))
+
+
+def test_robots_that_are_put_into_the_air(make_task):
+    """They touch nothing any more, as those of a new episode."""
+    task = make_task("a1_torque", 2)
+    task.base_pos[:, 2] = 0.2
+    task.step(torch.zeros(2, 12))
+    assert task.contacts.any() and task.state.contact_force.any()
+    qpos = task.sim.qpos.clone()
+    qpos[:, 2] = 2.0
+    task.set_state(qpos, task.sim.qvel)
+    assert torch.equal(task.sim.qpos, qpos)
+    for name in ("contacts", "feet_contact", "contact_force"):
+        assert not getattr(task.state, name).any(), name
+
+
 def test_air_time_ends_with_a_touch(make_task):
     """The touching step is rewarded for the swing that it ends; then the count starts anew."""
     task = make_task("a1_torque", 1)

@@ -50,7 +50,10 @@ def test_order_and_commands(stage, tmp_path):
 
 
 def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
-    """It is tried once more; status 1, the end of its log is shown; the next call tries it, and only it, again."""
+    """It is tried once more; status 1, the end of its log is shown; the next call tries it, and only it, again.
+
+    Without settings that can be read it fails as well; ``--dry-run`` says so.
+    """
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("fail a1_position-low-s1")
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
@@ -63,6 +66,11 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     assert (status, error) == (0, "") and "2 of 2 cells are done." in output
     failed, other = "a1_position-low-s1", "a1_torque-low-s1"
     assert trained(stage) == [failed, failed, other, failed]
+    (config,) = out.glob(f"{failed}/*/config.yaml")
+    config.write_text(config.read_text().replace("max_iterations: 4,", ""))
+    listed = experiment_here(file, f"--out={out}", "--device=cpu", "--dry-run", tmp_path=tmp_path)
+    status, _, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert status == 1 and error.endswith(" lack max_iterations\n") and listed == (0, f"{error}{other}: done\n", "")
 
 
 def test_a_training_that_is_killed_is_tried_again(stage, tmp_path):

@@ -3,8 +3,9 @@
 import pytest
 from support.settings import error_of
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import LeggedRobotCfg, task_registry
 from legged_torque.envs.base.asset import load_asset
+from legged_torque.motors.config import DelayCfg
 from legged_torque.utils.options import Options, simulated_latency
 
 REFUSED = {
@@ -43,6 +44,24 @@ def test_delay_of_a_simulated_robot(tmp_path, delay, late):
         cfg = task_registry.get_cfgs("go2_torque")[0]
         name = str(tmp_path / motors) if "." in motors else motors
         assert simulated_latency(cfg, name, given) == pytest.approx(expected)
+
+
+class BusCfg(LeggedRobotCfg):
+    """A robot whose delay has a name of its own."""
+
+    class motors:
+        chain = ["bus", "ideal"]
+
+        class bus(DelayCfg):
+            pass
+
+
+def test_delay_of_another_name(tmp_path):
+    """That of the chain counts."""
+    (tmp_path / "own.yaml").write_text("motors: {delay: {range: [0, 4]}, bus: {range: [3, 3]}}")
+    assert simulated_latency(BusCfg(), str(tmp_path / "own.yaml"), None) == pytest.approx(0.015)
+    (tmp_path / "own.yaml").write_text("motors: {bus: {range: [0, 4]}}")
+    assert "motors.bus of" in error_of(simulated_latency, BusCfg(), str(tmp_path / "own.yaml"), None)
 
 
 def test_delay_that_varies(tmp_path):

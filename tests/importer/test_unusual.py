@@ -10,6 +10,7 @@ from support.urdf import urdf_of
 
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import check, import_robot
+from legged_torque.utils.errors import UserError
 
 
 @pytest.fixture
@@ -124,6 +125,23 @@ def with_parts(links, joints):
     return links, joints
 
 
+def with_spine(links, joints):
+    """Let the rear legs begin at a part of the trunk that moves."""
+    links["rear"] = [[3, [0, 0, 0], [0, 0, 0], [0.02, 0, 0, 0.02, 0, 0.02]], [["box", [0.1] * 3, [0] * 3, [0] * 3]]]
+    for row in joints:
+        row[2] = "rear" if row[0] in ("RL_joint1", "RR_joint1") else row[2]
+    return links, [*joints, ["spine", "revolute", "base", "rear", [0, 0, 0], [0, 0, 0], [0, 1, 0], [-1, 1, 9, 9]]]
+
+
+def with_toe(links, joints):
+    """Let a calf end in a toe and a heel, which move."""
+    links["toe"] = [[0.05, [0, 0, 0], [0, 0, 0], [1e-5, 0, 0, 1e-5, 0, 1e-5]], [["sphere", [0.02], [0] * 3, [0] * 3]]]
+    links["heel"] = links["toe"]
+    ends = [("toe", [0.05, 0, -0.2]), ("heel", [-0.05, 0, -0.2])]
+    moves = ([0, 0, 0], [0, 1, 0], [-1, 1, 9, 9])
+    return links, [*joints, *([name, "revolute", "FL_link3", name, place, *moves] for name, place in ends)]
+
+
 def with_payload(links, joints):
     """Fix a link with a mass to the trunk."""
     links["payload"] = [[0.3, [0, 0, 0], [0, 0, 0], [1e-4, 0, 0, 1e-4, 0, 1e-4]], []]
@@ -168,6 +186,15 @@ def test_unusual(imported, name):
     assert sum("trunk" in model.geom(geom).name for geom in range(model.ngeom)) == 1
     masses = re.findall('mass value="([^"]*)"', text)
     assert model.body_mass.sum() == pytest.approx(sum(map(float, masses)))
+
+
+@pytest.mark.parametrize(
+    ("change", "shared"), [(with_spine, "'rear'"), (with_toe, "'FL_link1', 'FL_link2', 'FL_link3'")]
+)
+def test_branching_legs(imported, change, shared):
+    """Bodies that would belong to two legs are refused by name."""
+    with pytest.raises(UserError, match=f"its legs must not branch, or share bodies: {shared}$"):
+        imported(urdf_of(*change(*legged(FOUR, three, SPHERE))))
 
 
 def test_turned_root(imported):

@@ -51,7 +51,11 @@ def make_runner(log_root, normalized=False):
     env_cfg, train_cfg = task_registry.get_cfgs(args.task, args)
     train_cfg.runner.logger = "none"
     if normalized:
-        train_cfg.critic.obs_normalization = True
+
+        class Normalizing(type(train_cfg.critic)):
+            obs_normalization: bool = True
+
+        train_cfg.critic = Normalizing()
     set_seed(train_cfg.seed)
     env, _ = task_registry.make_env(args.task, args, env_cfg)
     runner, _ = task_registry.make_alg_runner(env, args.task, train_cfg=train_cfg, log_root=log_root)

@@ -107,6 +107,14 @@ def test_curricula_are_shorter(steps):
     torch.testing.assert_close(values["laptop"], values["parallel"])
 
 
+def test_the_bias_decays_sooner():
+    """Decaying action priors need three tenths of the steps, too."""
+    decay = {}
+    for preset in ("parallel", "laptop"):
+        decay[preset] = task_registry.get_cfgs("a1_decap", Options(device="cpu", preset=preset))[0].control.decap
+    assert decay["laptop"].k == pytest.approx(0.3 * decay["parallel"].k) and decay["parallel"].k == 409_600.0
+
+
 @pytest.mark.parametrize("preset", ["parallel", "laptop"])
 def test_the_pd_part_fades_in_time(preset):
     """A policy has to learn to walk without it while annealing has not made its steps small."""

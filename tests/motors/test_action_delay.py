@@ -172,6 +172,13 @@ def test_milliseconds(make_task):
     assert "motors.delay.range" in line and "2.5 ms" in line
 
 
+def test_a_delay_outside_the_chain(make_task):
+    """A note tells that it has no effect."""
+    settings = {"motors.chain": ["ideal"], **delayed(0, 3, "physics_steps")}
+    assert make_task("a1_torque", 1, **settings).notes == ["motors.delay has no effect: motors.chain lacks 'delay'"]
+    assert make_task("a1_torque", 1, **{**settings, "motors.chain": ["delay", "ideal"]}).notes == []
+
+
 def test_torques_that_cannot_follow(make_task):
     """Physics steps cannot be counted where torques are computed once per control step, unless there is no delay."""
     once = {"control.refresh_torques": False}

@@ -255,6 +255,19 @@ def test_draws_and_resets():
     assert (link.values.power[:100] == 0.0).all() and (link.values.power[100:, 0] > 0.0).any()
 
 
+@pytest.mark.parametrize(("model", "constants", "message"), TABLES["beyond"])
+def test_draws_beyond_the_bounds_of_a_constant(make_task, model, constants, message):
+    """They are refused where anything is drawn; those that reach the bounds are not."""
+    settings = {f"motors.{model}.{name}": value for name, value in constants.items()}
+    settings |= {"motors.chain": ["delay", "ideal", model]}
+    make_task("a1_position", 1, **settings)
+    settings["domain_rand.randomize_parameters"] = True
+    if message:
+        assert message in error_of(make_task, "a1_position", 1, **settings)
+    else:
+        make_task("a1_position", 1, **settings)
+
+
 @pytest.mark.parametrize(("task", "choice", "joint", "speed", "most"), TABLES["choices"])
 def test_choices(task, choice, joint, speed, most):
     """The motors of a robot have the torques of their sources."""

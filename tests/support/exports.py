@@ -22,8 +22,12 @@ def export_random(make_task, name, folder, normalization=False, supported=True, 
     task = make_task(name, num_envs=3, **overrides)
     task.load_state_dict({"total_steps": torch.tensor(TRAINING["total_steps"]), "num_diverged": torch.tensor(0)})
     _, train_cfg = task_registry.get_cfgs(name)
+
+    class Normalizing(type(train_cfg.actor)):
+        obs_normalization: bool = normalization
+
+    train_cfg.actor = Normalizing()
     train_cfg.actor.hidden_dims, train_cfg.obs_groups.actor = [16, 16], list(groups)
-    train_cfg.actor.obs_normalization = normalization
     torch.manual_seed(3)
     runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
     model = runner.alg.policy()

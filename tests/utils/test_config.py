@@ -75,6 +75,14 @@ def test_precedence():
         assert (env_cfg.env.num_envs, train_cfg.algorithm.clip_param, train_cfg.seed) == expected
 
 
+def test_misspelt_settings_of_a_training_s_objects(make_task):
+    """They are refused where the runner is made."""
+    train_cfg = get_cfgs()[1]
+    train_cfg.algorithm.learnin_rate = 1e-4
+    line = error_of(task_registry.make_alg_runner, make_task("a1_position", 1), train_cfg=train_cfg, log_root=None)
+    assert "unknown config key 'algorithm.learnin_rate'; did you mean 'algorithm.learning_rate'?" in line
+
+
 def test_number_of_worlds_suits_the_device(monkeypatch):
     """Without a wish, a GPU simulates thousands of worlds and a CPU as many as it can in seconds."""
     assert get_cfgs()[0].env.num_envs == 64

@@ -93,7 +93,7 @@ def test_up_and_down(server, tmp_path, tmp_path_factory, monkeypatch):
     server.models["first"] = {"model_1.pt": b""}
     assert_told_in_one_line(play(), "it holds no settings and checkpoint")
     monkeypatch.setitem(sys.modules, "wandb", None)
-    assert_told_in_one_line(play(), "wandb is not installed: pip install 'legged_torque[wandb]'")
+    assert_told_in_one_line(play(), "wandb is not installed; this needs the extra: pip install 'legged_torque[wandb]'")
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,12 @@ def test_command(make_session):
     ask(session.set_command, None, count=4)
     drawn = session.task.commands
     assert drawn.abs().max() <= 1.0 and len(drawn.unique()) == 3 * NUM_ENVS
+    torch.manual_seed(3)
+    session.task.command_generator.hold(None)
+    once = session.task.commands.clone(), torch.get_rng_state()
+    torch.manual_seed(3)
+    session.hold(None)
+    assert torch.equal(session.task.commands, once[0]) and torch.equal(torch.get_rng_state(), once[1])
 
 
 def test_a_task_with_one_command(make_session):

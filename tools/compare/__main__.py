@@ -21,10 +21,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from legged_torque.deploy.description import require
 from legged_torque.utils.cli import Parser, check_args, check_output, run_script
 from legged_torque.utils.devices import device_name, resolve_device
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count
 from tools.compare import measure

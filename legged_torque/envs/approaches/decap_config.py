@@ -15,6 +15,10 @@ class DecapCfg(TorqueCfg):
             record: str = ""  # CSV file of the reference by joint [rad], from an episode's start; empty: nominal pose
             row_time: Positive = 0.02  # [s] for which a row of it is the reference
 
+            def scale_steps(self, factor: float) -> None:
+                """Let the bias decay in ``factor`` times the steps."""
+                self.k *= factor
+
     class rewards:
         imitation_temperature: Positive = 10.0  # of the term
 

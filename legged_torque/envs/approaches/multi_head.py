@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.approaches.multi_head_config import CurriculumMultiHeadCfg as CurriculumMultiHeadCfg
-from legged_torque.envs.approaches.multi_head_config import MultiHeadCfg as MultiHeadCfg
 from legged_torque.envs.approaches.multi_head_config import MultiHeadCfgPPO as MultiHeadCfgPPO
 from legged_torque.envs.approaches.multi_head_config import MultiHeadTwoRatesCfg as MultiHeadTwoRatesCfg
-from legged_torque.envs.approaches.multi_head_config import MultiHeadTwoRatesCfgPPO as MultiHeadTwoRatesCfgPPO
 from legged_torque.envs.approaches.multi_head_config import TorqueMultiHeadCfg as TorqueMultiHeadCfg
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.approaches.torque_curriculum import TorqueCurriculumRobot

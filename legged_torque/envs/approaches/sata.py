@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.approaches.sata_config import SataCfg as SataCfg
-from legged_torque.envs.approaches.sata_config import SataCfgPPO as SataCfgPPO
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.motors.models import MuscleModel

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfg as TorqueCurriculumCfg
-from legged_torque.envs.approaches.torque_curriculum_config import TorqueCurriculumCfgPPO as TorqueCurriculumCfgPPO
 
 
 class TorqueCurriculumRobot(TorqueRobot):

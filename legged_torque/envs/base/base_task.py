@@ -98,6 +98,8 @@ class BaseTask(VecEnv):
         "final_observations": those of all worlds before any reset. Rewards, dones and extras are buffers that the next
         step overwrites.
         """
+        if actions.shape != (wanted := self._given_actions.shape):
+            raise UserError(f"actions must have the shape {tuple(wanted)}, not {tuple(actions.shape)}")
         self._given_actions.copy_(actions)
         self.step_graph()
         extras: dict[str, Any] = {"time_outs": self.state.time_out_buf}

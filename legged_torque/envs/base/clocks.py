@@ -1,5 +1,6 @@
 """The clocks of a task, in Hz: how often its policy acts, and how often its physics and motors step."""
 
+from collections.abc import Iterator
 from typing import Any
 
 from legged_torque.motors.config import DelayCfg, LatencyCfg
@@ -42,6 +43,14 @@ def delays(cfg: Any) -> dict[str, LatencyCfg]:
     """Return settings of delays by path: of all links of motors, in the chain or not, and of sensing."""
     links = {f"motors.{name}": link for name, link in vars(cfg.motors).items() if isinstance(link, DelayCfg)}
     return links | {"sensing.delay": cfg.sensing.delay}
+
+
+def idle_delays(cfg: Any) -> Iterator[str]:
+    """Yield a note for each delay that is set, but is no link of the chain of motors."""
+    for name, link in vars(cfg.motors).items():
+        is_set = isinstance(link, DelayCfg) and (link.range[1] or link.jitter or link.loss)
+        if is_set and name not in cfg.motors.chain:
+            yield f"motors.{name} has no effect: motors.chain lacks '{name}'"
 
 
 def whole_steps(path: str, steps: float) -> int:

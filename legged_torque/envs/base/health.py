@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from legged_torque.envs.base.observations import Observations
@@ -16,8 +17,8 @@ def watched(
     """Return actions, what a world keeps from step to step, torques, rewards and observations, causes first.
 
     All of them have the values now that they have in a healthy world at the start. The physical state is not among
-    them: the simulator itself flags worlds in which that diverged. ``kept`` are further tensors by name, shape
-    (num_envs, any); others are left out.
+    them: the simulator itself flags worlds in which that diverged. ``kept`` are further tensors by name, float32 and of
+    shape (num_envs, any); others are left out, as are those that are not finite at the start.
     """
     buffers = {
         **kept,
@@ -29,7 +30,9 @@ def watched(
         "episode_sums": rewards.episode_sums.T,
         "observation_history": observations.history,
     }
-    per_world = {name: numbers for name, numbers in buffers.items() if len(numbers) == state.num_envs}
+    rows = {name: numbers for name, numbers in buffers.items() if len(numbers) == state.num_envs}
+    numeric = {name: row.unsqueeze(-1).flatten(1) for name, row in rows.items() if row.dtype == torch.float32}
+    per_world = {name: numbers for name, numbers in numeric.items() if numbers.isfinite().all()}
     terms = zip(rewards.names, rewards.terms.unsqueeze(-1), strict=True)
     return [
         *(Watched("buffer", name, numbers) for name, numbers in per_world.items()),

@@ -3,6 +3,7 @@
 import difflib
 import inspect
 from collections.abc import Iterator
+from types import CodeType
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.utils.config import section_keys, successor
@@ -18,11 +19,24 @@ def check_methods(task: type, base: type, cfg: LeggedRobotCfg) -> None:
     """
     terms = {"_reward_": ("rewards.scales", section_keys(cfg.rewards.scales))}
     terms["_termination_"] = ("terminations", section_keys(cfg.terminations))
-    refuse([problem for owner in task.__mro__ if not issubclass(base, owner) for problem in _idle(owner, base, terms)])
+    owners = [owner for owner in task.__mro__ if not issubclass(base, owner)]
+    methods = [(name, value) for owner in owners for name, value in vars(owner).items() if inspect.isfunction(value)]
+    used = {used for name, method in methods for used in _names(method.__code__) if used != name}
+    refuse([problem for owner in owners for problem in _idle(owner, base, terms, used)])
 
 
-def _idle(owner: type, base: type, terms: dict[str, tuple[str, list[str]]]) -> Iterator[str]:
-    """Yield such methods of a class; ``terms`` are section and names of settings by the beginning of methods."""
+def _names(code: CodeType) -> Iterator[str]:
+    """Yield the names that code and what is defined in it refer to."""
+    yield from code.co_names
+    for part in code.co_consts:
+        yield from _names(part) if isinstance(part, CodeType) else ()
+
+
+def _idle(owner: type, base: type, terms: dict[str, tuple[str, list[str]]], used: set[str]) -> Iterator[str]:
+    """Yield such methods of a class; helpers are none, whose names are ``used`` in other methods.
+
+    ``terms`` are section and names of settings by the beginning of methods.
+    """
     hooks = [name for name in dir(base) if inspect.isroutine(getattr(base, name))]
     for name in (name for name, value in vars(owner).items() if inspect.isroutine(value) and not name.startswith("__")):
         beginning = next(filter(name.startswith, terms), "")
@@ -31,6 +45,8 @@ def _idle(owner: type, base: type, terms: dict[str, tuple[str, list[str]]]) -> I
         hint = f"; did you mean '{near[0]}'?" if near else ""
         if replaced := successor("methods", name):
             yield f"{owner.__name__}: {replaced}"
+        elif name in used:
+            continue
         elif beginning and term not in settings:
             yield f"{owner.__name__}.{name} is never called: there is no setting {section}.{term}{hint}"
         elif near and not beginning and name not in hooks:

@@ -11,6 +11,7 @@ from torch import Tensor
 from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParameters, position_residual
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
+from legged_torque.envs.base.clocks import idle_delays
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
@@ -107,7 +108,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._init_random_events()
         self._init_observations()
         kept = {"actions": self._given_actions, **self.randomization.fields, **self.motors.watched()}
-        kept |= {"random_parameters": self.randomization.values, **self.sensors.watched()}
+        kept |= {"random_parameters": self.randomization.values, **self.sensors.watched(), **self._world_state}
         self.health = Health(watched(self.state, kept, self.rewards, self.observations), self.sim.diverged)
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
@@ -283,9 +284,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
         """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
-        self.sim.qpos.copy_(qpos)
-        self.sim.qvel.copy_(qvel)
-        self.state.update()
+        self.state.place(qpos, qvel)
         self.command_generator.update()
         self.sensors.begin_episodes(self.state.reset_buf)
         self.sensors.update_all(self.state.reset_buf, compilable=False)
@@ -312,7 +311,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         self.symmetry = self.asset.symmetry(cfg.asset.mirrored_legs)
-        self.notes = [*self.asset.notes, *self.sim.notes]
+        self.notes = [*self.asset.notes, *self.sim.notes, *idle_delays(cfg)]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""

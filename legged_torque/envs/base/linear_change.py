@@ -1,4 +1,4 @@
-"""Settings of values that change while a policy learns."""
+"""Settings of values that change while a policy learns: sections with a method ``scale_steps``."""
 
 from legged_torque.utils.config import Section, section_keys
 from legged_torque.utils.errors import UserError
@@ -19,11 +19,15 @@ class LinearChange(Section):
         if self.t_start > self.t_end:
             raise UserError(f"{path}.t_start must be at most its t_end, {self.t_end}, not {self.t_start}")
 
+    def scale_steps(self, factor: float) -> None:
+        """Begin and end after ``factor`` times the steps."""
+        self.t_start, self.t_end = round(factor * self.t_start), round(factor * self.t_end)
+
 
 def scale_changes(settings: Section, factor: float) -> None:
-    """Let all linear changes within settings begin and end after ``factor`` times their steps."""
+    """Let all changes within settings take ``factor`` times their steps."""
     for section in (getattr(settings, key) for key in section_keys(settings)):
-        if isinstance(section, LinearChange):
-            section.t_start, section.t_end = round(factor * section.t_start), round(factor * section.t_end)
+        if hasattr(section, "scale_steps"):
+            section.scale_steps(factor)
         elif isinstance(section, Section):
             scale_changes(section, factor)

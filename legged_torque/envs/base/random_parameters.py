@@ -1,7 +1,6 @@
 """The numbers of the robot, the ground and the controller that are drawn at random (paper, App. I-B)."""
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.randomization import RandomParameter, fixed
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import Limits
 from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
 from legged_torque.utils.mjcf import joint_limits
 from legged_torque.utils.options import CONTACT
@@ -87,17 +87,17 @@ def robot_parameters(
 
     def of_joints(name: str, field: str, columns: Sequence[int], unit: str, add_unit: Any = 1.0) -> RandomParameter:
         """Return a parameter with a number per joint."""
-        more: dict[str, Any] = {"may_keep": True, "at_least": 0.0, "mirror": joint_values}
+        more: dict[str, Any] = {"may_keep": True, "bounds": Limits(0), "mirror": joint_values}
         return RandomParameter(name, field, columns, draws[name], unit, add_unit=add_unit, **more)
 
     mass, inertia, radii = draws["trunk_mass"], entries(3, [TRUNK]), [3 * foot for foot in feet]
     trunk: dict[str, Any] = {"shared": True, "add_unit": inertia_per_mass}
     com: dict[str, Any] = {"shared": True, "listed_by_column": True, "mirror": VECTOR}
     return [
-        RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg", at_least=LEAST_MASS),
+        RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg", bounds=Limits(LEAST_MASS)),
         RandomParameter("trunk_inertia", "body_inertia", inertia, mass, "kg m^2", same_draw_as="trunk_mass", **trunk),
         RandomParameter("trunk_com", "body_ipos", entries(3, [TRUNK]), draws["trunk_com"], "m", **com),
-        RandomParameter("foot_radius", "geom_size", radii, foot_radius, "m", shared=True, at_least=0.0),
+        RandomParameter("foot_radius", "geom_size", radii, foot_radius, "m", shared=True, bounds=Limits(0)),
         RandomParameter("foot_pos", "geom_pos", entries(3, feet), draws["foot_pos"], "m", mirror=foot_vectors),
         of_joints("dof_damping", "dof_damping", dofs, "N m s/rad", control.d_gains[0].tolist()),
         of_joints("dof_armature", "dof_armature", dofs, "kg m^2"),
@@ -111,16 +111,16 @@ def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[R
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     friction = model.geom_friction[geoms]  # tangential, torsional, rolling
     kinds = list((friction / friction[:, :1]).ravel())
-    slides: dict[str, Any] = {"shared": True, "set_unit": kinds, "add_unit": kinds, "at_least": 0.0}
+    slides: dict[str, Any] = {"shared": True, "set_unit": kinds, "add_unit": kinds, "bounds": Limits(0)}
 
     def of_solref(part: int, **more: Any) -> RandomParameter:
         """Return a number of all solrefs; those of MuJoCo's direct format, which are set, are negative."""
         name, own = CONTACT[part], model.geom_solref[geoms, part].tolist()
         columns, signs = [2 * geom + part for geom in geoms], [1.0 if number > 0.0 else -1.0 for number in own]
-        more |= {"own": own, "set_unit": -1.0, "add_unit": signs, "shared": True, "at_least": 0.0}
+        more |= {"own": own, "set_unit": -1.0, "add_unit": signs, "shared": True, "bounds": Limits(0)}
         return RandomParameter(name, "geom_solref", columns, draws[name], **more)
 
-    down: dict[str, Any] = {"set_unit": -1.0, "add_unit": -1.0, "at_least": 0.0}
+    down: dict[str, Any] = {"set_unit": -1.0, "add_unit": -1.0, "bounds": Limits(0)}
     return [
         RandomParameter("ground_friction", "geom_friction", entries(3, geoms), draws["ground_friction"], **slides),
         of_solref(0),
@@ -141,13 +141,13 @@ def control_parameters(
     def of_joints(name: str, field: Tensor, unit: str) -> RandomParameter:
         """Return a parameter with one draw for all joints, and one per joint if it has such a range."""
         images = mirror.unsigned() if mirror and "scale_per_joint" in draws[name] else None
-        return RandomParameter(name, field, joints, draws[name], unit, shared=True, at_least=0.0, mirror=images)
+        return RandomParameter(name, field, joints, draws[name], unit, shared=True, bounds=Limits(0), mirror=images)
 
     scale = draws["action_scale"]
     return [
         of_joints("motor_strength", strength, ""),
         RandomParameter("joint_offset", control.joint_offset, joints, draws["joint_offset"], "rad", mirror=mirror),
-        RandomParameter("action_scale", control.action_scale, [0], scale, "rad", at_least=0.0),
+        RandomParameter("action_scale", control.action_scale, [0], scale, "rad", bounds=Limits(0)),
         RandomParameter(
             "torque_scale",
             control.torque_scale,
@@ -171,11 +171,12 @@ def with_settings(parameters: Sequence[RandomParameter], rand: Any, draws: Mappi
     kept = []
     for parameter in parameters:
         setting = parameter.name if parameter.name in draws else parameter.same_draw_as or parameter.name
-        kept.append(fixed(parameter) if setting in rand.keep_fixed else parameter)
+        is_kept = setting in rand.keep_fixed or (rand._swept and setting not in rand._swept)
+        kept.append(fixed(parameter) if is_kept else parameter)
     if rand.randomize_parameters:
         _refuse_mixed_solrefs([parameter for parameter in kept if parameter.name in CONTACT])
         return kept
-    return [dataclasses.replace(parameter, at_least=-math.inf) for parameter in kept]
+    return [dataclasses.replace(parameter, bounds=Limits()) for parameter in kept]
 
 
 def _refuse_mixed_solrefs(drawn: Sequence[RandomParameter]) -> None:

@@ -92,6 +92,14 @@ class RobotState(Buffers):
         self._bodies = {body.name: Points(sim, self._fields, [body.id]) for body in bodies if body.name}
         self._origin = torch.zeros(1, 1, 3, device=sim.device)
 
+    def place(self, qpos: Tensor, qvel: Tensor) -> None:
+        """Put all worlds into states; nothing has touched anything there yet, as after a reset."""
+        self.qpos.copy_(qpos)
+        self.qvel.copy_(qvel)
+        self._contact_found.zero_()
+        self.contact_force.zero_()
+        self.update()
+
     def update(self) -> None:
         """Compute what follows from the simulator's state."""
         in_world = torch.stack([self.qvel[:, :3], self._gravity])

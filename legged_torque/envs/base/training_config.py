@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import os
 from collections.abc import Iterable
@@ -14,7 +13,7 @@ from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.flashsac_config import FLASHSAC
 from legged_torque.envs.base.linear_change import scale_changes
 from legged_torque.utils.config import BaseConfig, flat, section_keys, to_dict, update_from_dict
-from legged_torque.utils.errors import UserError, check_names, unknown_name
+from legged_torque.utils.errors import UserError, check_names, require, unknown_name
 
 if TYPE_CHECKING:
     from rsl_rl.env import VecEnv
@@ -123,8 +122,9 @@ class TrainingCfg(BaseConfig):
             task: Its name, for checkpoints.
             log_dir: Folder of the run; None keeps nothing.
         """
-        if log_dir and self.runner.logger == "wandb" and importlib.util.find_spec("wandb") is None:  # type: ignore[attr-defined]
-            raise UserError("--logger wandb needs the extra: pip install 'legged_torque[wandb]'")
+        self.check()
+        if log_dir and self.runner.logger == "wandb":  # type: ignore[attr-defined]
+            require("wandb", extra="wandb")
         from rsl_rl.utils import resolve_callable
 
         settings = self.to_rsl_rl()

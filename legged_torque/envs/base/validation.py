@@ -19,6 +19,8 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
             raise UserError(f"rewards.scales.{name} needs asset.mirrored_legs: which legs are right and left of a pair")
     if cfg.rewards.scales.base_height and not cfg.rewards.base_height_target > 0.0:
         raise UserError(f"rewards.base_height_target must be greater than 0, not {cfg.rewards.base_height_target}")
+    if cfg.commands.curriculum and cfg.commands.fixed is not None:
+        raise UserError("commands.curriculum has no effect with commands.fixed: set one of them")
     if cfg.terrain.mesh_type == "heightfield":
         _check_map(cfg)
     parameters = cfg.random_parameters()

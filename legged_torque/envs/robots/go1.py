@@ -1,6 +1,7 @@
 """The Unitree Go1: figures of MuJoCo Menagerie and of Unitree's URDF, the same for all approaches."""
 
-from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
 from legged_torque.motors.model_config import ASSUMED_VOLTAGE, CurveCfg
 
 
@@ -17,12 +18,7 @@ class Go1Cfg(LeggedRobotCfg):
 
     class init_state:
         pos = [0.0, 0.0, 0.42]
-        default_joint_angles = (
-            {"FR_hip_joint": -0.1, "FR_thigh_joint": 0.8, "FR_calf_joint": -1.5}
-            | {"FL_hip_joint": 0.1, "FL_thigh_joint": 0.8, "FL_calf_joint": -1.5}
-            | {"RR_hip_joint": -0.1, "RR_thigh_joint": 1.0, "RR_calf_joint": -1.5}
-            | {"RL_hip_joint": 0.1, "RL_thigh_joint": 1.0, "RL_calf_joint": -1.5}
-        )
+        default_joint_angles = A1Cfg.init_state.default_joint_angles
 
     class control:
         stiffness = 20.0
@@ -44,9 +40,5 @@ class Go1Cfg(LeggedRobotCfg):
         base_height_target = 0.325
 
 
-class Go1CfgPPO(LeggedRobotCfgPPO):
+class Go1CfgPPO(A1CfgPPO):
     """Training of a Go1, which is the same left and right."""
-
-    class algorithm:
-        class symmetry_cfg:
-            use_data_augmentation = True
