@@ -23,7 +23,7 @@ LOSS_NAMES = ("value", "surrogate", "entropy", "kl", "gradient_norm", "critic_gr
 
 
 class TorchPPO(PPO):
-    """PPO whose minibatch update has fixed shapes and never waits for the host, so that it replays as a CUDA graph.
+    """PPO whose epochs have fixed shapes and never wait for the host, so that each replays as a CUDA graph.
 
     The losses are rsl_rl's. The adaptive learning rate is a tensor. A minibatch whose gradient norm is not finite
     leaves the networks and the optimizer untouched and is counted. If a weight or a moment is not finite after an
@@ -33,7 +33,9 @@ class TorchPPO(PPO):
 
     Attributes:
         warm_up_iterations: Iterations at the start of a training in which only the critic learns.
-        update_graph: The update from the samples of ``indices``.
+        order: The samples of a rollout, in the order of an epoch. Shape: (batch_size * num_mini_batches,), int64.
+        indices: Those of the minibatch that is learned from. Shape: (batch_size,), int64.
+        update_graph: An epoch, which takes a gradient step on each minibatch of ``order``.
         product_dtype: Numbers that matrix products take; those of float32 may be TF32.
     """
 
@@ -81,9 +83,10 @@ class TorchPPO(PPO):
         self._skip = torch.zeros((), device=self.device)
         self.optimizer.found_inf = self._skip  # type: ignore[attr-defined] # where it is 1, a fused optimizer skips
         self.losses = torch.zeros(len(LOSS_NAMES), device=self.device)
-        self.indices = torch.zeros(self.batch_size, dtype=torch.long, device=self.device)
+        self.order = torch.zeros(self.batch_size * self.num_mini_batches, dtype=torch.long, device=self.device)
+        self.indices = self.order[: self.batch_size]
         self.product_dtype = torch.float32
-        self.update_graph = CudaGraph(self.update_minibatch, self.device)
+        self.update_graph = CudaGraph(self.update_epoch, self.device)
 
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
@@ -174,10 +177,8 @@ class TorchPPO(PPO):
         self.losses.zero_()
         before = [tensor.clone() for tensor in self.tensors()]
         for _ in range(self.num_learning_epochs):
-            order = torch.randperm(self.batch_size * self.num_mini_batches, device=self.device)
-            for indices in order.split(self.batch_size):
-                self.indices.copy_(indices)
-                self.update_graph()
+            torch.randperm(len(self.order), out=self.order)
+            self.update_graph()
         self._update_normalization()
         self.storage.clear()
         is_finite = torch.cat([tensor.flatten() for tensor in self.tensors()]).isfinite().all()
@@ -254,6 +255,12 @@ class TorchPPO(PPO):
             actor_loss = actor_loss + self.symmetry.mirror_loss_coeff * mirror_loss
         loss = self.actor_learns * actor_loss + self.value_loss_coef * value_loss
         return loss, torch.stack([value_loss, surrogate_loss, entropy, kl]).detach()
+
+    def update_epoch(self) -> None:
+        """Take one gradient step on each minibatch of the samples in ``order``."""
+        for indices in self.order.split(self.batch_size):
+            self.indices = indices
+            self.update_minibatch()
 
     def update_minibatch(self) -> None:
         """Take one gradient step on the samples of ``indices``."""
