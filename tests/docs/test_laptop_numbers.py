@@ -37,7 +37,7 @@ def test_few_worlds():
     """Mean and latest of the steps after which evaluations track 70%, and how many seeds come there."""
     data, walking = laptop_settings()
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 6 and data[SETTINGS].drop_duplicates().shape[0] == 54
+    assert len(rows) == 5 and data[SETTINGS].drop_duplicates().shape[0] == 59
     seeds = data.groupby([*SETTINGS, "task"])["seed"].nunique()
     for size, batches, epochs, *cells, _ in rows:
         shape, _, others = size.partition(", ")
@@ -97,7 +97,7 @@ def test_half_of_the_mirror_images():
     text = text_of("tried.md", "**Mirror images in place")
     few = [ratios[batches, 5] for batches in (2, 3, 4)]
     assert {f"{ratio:.1f}" for ratio in few} == {"1.7"} and "1.7 times the steps to 70% with 2 to 4" in text
-    assert f"{ratios[2, 7]:.2f} times with 7 epochs ({len(runs)} pairs" in text.replace("\n", " ")
+    assert f"{ratios[2, 7]:.2f} times with 7 epochs ({len(runs)} pairs)" in text.replace("\n", " ")
     ends = data[data["other"].str.contains("fade") & data["other"].str.endswith("20M")]
     ends = ends.groupby(["other", "task", "seed"]).apply(at_the_end)
     lost = ends.loc[f"{today} 20M"] - ends.loc[f"{today} half images 20M"]
@@ -122,6 +122,24 @@ def test_half_of_the_mirror_images():
 def after(seconds):
     """Minutes and seconds, as the documents write them."""
     return [f"{s // 60:.0f}:{s % 60:02.0f}" for s in seconds]
+
+
+def test_smaller_networks():
+    """How many times the steps networks of [64, 64] need, and what is lost at the end."""
+    data = pd.read_csv(DOCS / "results" / "laptop_settings.csv.xz").query("other.str.startswith('networks', na=False)")
+    data["other"], tasks = data["other"].str.removesuffix(" 20M"), [*data["task"].unique()[:3]]
+    runs = data[data["task"].isin(tasks)].groupby(["other", "task", "seed"])
+    text, logarithms = text_of("tried.md", "**Networks of [64, 64]**").replace("\n", " "), {}
+    for share in (0.7, 0.8):
+        walks = data[(data["track_percentage"] >= share) & (data["steps"] < 7.6e6)]
+        steps = walks.groupby(["other", "task", "seed"])["steps"].min().reindex([*runs.groups]) / 1e6
+        logarithms[share] = np.log(steps.fillna(7.5)).groupby("other").agg(["mean", "size"])
+    more = {share: np.exp(of["mean"]["networks 64"] - of["mean"]["networks 128"]) for share, of in logarithms.items()}
+    sizes = {share: {*of["size"][["networks 64", "networks 128"]]} for share, of in logarithms.items()}
+    assert f"{more[0.7]:.2f} times the steps to 70%, {more[0.8]:.2f} times those to 80% (24 runs)" in text
+    ends = runs.filter(lambda run: run["steps"].max() > 2e7).groupby(["other", "task", "seed"]).apply(at_the_end)
+    lost = ends["networks 128"] - ends["networks 64"]
+    assert sizes == {0.7: {24}, 0.8: {24}} and f"end {lost.mean():.2f} lower ({len(lost)} pairs)" in text
 
 
 def test_laptop():
