@@ -180,7 +180,9 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
         check_names("perturbation", cell.evaluated_in, env_cfg.perturbations())
         for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
             options.set = [*words, *set_words(settings)]
-            check_env_cfg(changed := task_registry.get_new_cfgs(options)[0])
+            changed = task_registry.get_new_cfgs(options)[0]
+            changed.commands.curriculum = False  # as evaluations have it
+            check_env_cfg(changed)
             if evaluation.startswith(SWEEP):
                 draw_only(changed, evaluation.removeprefix(SWEEP))
             if to_dict(changed.asset) != to_dict(env_cfg.asset):

@@ -188,7 +188,7 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
         row.column_low, row.column_span = of_column[0], of_column[1] - of_column[0]
         row.keep_probability = keep_probability if parameter.may_keep else 0.0
         corners = [(base + weight * add) * factor * other for add, factor, other in product(offset, scale, of_column)]
-        for extreme in sorted(math.copysign(1.0, weight) * float(np.float32(corner)) for corner in corners):
+        for extreme in sorted(math.copysign(1.0, weight) * float(f"{corner:.6g}") for corner in corners):
             if not parameter.bounds.allow(extreme):
                 raise UserError(
                     f"random parameter '{parameter.name}' can be {extreme:g} with the ranges given; it must be "

@@ -53,14 +53,12 @@ def test_whole_trainings():
         "performance.md", "- **Training.**"
     )
     speeds = {name: pd.DataFrame(whole[name])["steps_per_s"].mean() for name in ("two", "each_step", "no_exchange")}
-    times, text = (
-        {name: speed / one["steps_per_s"] for name, speed in speeds.items()},
-        text_of("performance.md", "- **Two"),
-    )
+    times = {name: speed / one["steps_per_s"] for name, speed in speeds.items()}
+    text = text_of("performance.md", "- **Two")
     assert f"make {speeds['two'] / 1e6:.1f} million steps/s, {times['two']:.2f} times those of one" in text
     others = sorted(each["two_gpus_steps_per_s"] / each["one_gpu_steps_per_s"] for each in whole["earlier"])
     assert f"{times['each_step']:.2f}, on other machines {others[0]:.2f} to {others[-1]:.2f})" in text
-    assert f"without exchange of gradients {times['no_exchange']:.2f}." in text
+    assert f"without exchanging gradients, {times['no_exchange']:.2f}." in text
     reached = next(each for each in DATA if "seeds" in each)
     until, small = reached["seeds"], pd.DataFrame(reached["small"]["rows"]).groupby("settings")
     (first, last), late = ((min(of), max(of)) for of in ([s[key][0] for s in until if s[key]] for key in ("70", "85")))

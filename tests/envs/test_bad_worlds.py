@@ -191,9 +191,9 @@ class DividingRobot(TorqueCurriculumRobot):
     def _init_buffers(self):
         """Add the divisors."""
         super()._init_buffers()
-        self.mean = self.keep("mean", torch.full((self.num_envs,), 0.5))
+        self.mean = self.keep("actions", torch.full((self.num_envs,), 0.5))
         self.nearest = self.keep("nearest", torch.full((self.num_envs, 2), math.inf))
-        self.count = self.keep("count", torch.full((self.num_envs,), -1))  # NaN, if it was read as a float
+        self.count = self.keep("count", torch.full((self.num_envs,), -1))  # NaN, if it were read as a float
         self.reward_divisor, self.observation_divisor = torch.ones(2, self.num_envs, 1).unbind()
 
     def _reward_ratio(self):
@@ -272,7 +272,9 @@ def test_a_tensor_of_ones_own(make_dividing):
     task.mean[1] = math.nan
     results = steps(task, 2)
     assert [result[3].tolist() for result in results] == [[False, True, False], [False] * 3]
-    assert reported(task) == {"buffer 'mean'": 1} and task.mean.tolist() == [0.5] * 3
+    assert reported(task) == {"buffer 'task.actions'": 1} and task.mean.tolist() == [0.5] * 3
+    task.step(torch.tensor([0.0, math.nan, 0.0]).unsqueeze(1).expand(-1, 12))  # whose own name that is
+    assert reported(task) == {"buffer 'actions'": 1}
     assert task.nearest.isinf().all() and (task.count == -1).all()
 
 

@@ -62,6 +62,7 @@ def test_methods_of_ones_own():
         def _reward_alive(self):
             return self.count
 
+        @property
         def swing_height(self):
             return [scale * self._reward_swing() for scale in self.action_term()]
 
@@ -74,7 +75,7 @@ def test_methods_of_ones_own():
     task = Counting(small())
     for step in range(1, 4):
         task.step(torch.zeros(2, 12))
-        assert task._reward_alive().tolist() == task.swing_height()[0].tolist() == [step, step]
+        assert task._reward_alive().tolist() == task.swing_height[0].tolist() == [step, step]
 
 
 def test_a_misspelt_hook_that_only_calls_itself():

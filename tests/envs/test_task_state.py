@@ -56,6 +56,8 @@ def test_a_name_is_kept_once(make_task):
     phase = task.keep("phase", torch.zeros(2, 1))
     assert "task.keep has 'phase' twice" in error_of(task.keep, "phase", torch.ones(2, 1))
     assert task.world_state_dict()["task"]["phase"] is phase
+    for other in (torch.zeros(()), torch.zeros(3, 2), torch.zeros(3, 2).T):  # no rows of worlds that lie in one piece
+        assert "takes contiguous tensors with a row per world; 'other' is none" in error_of(task.keep, "other", other)
 
 
 def test_actions_of_another_shape(make_task):

@@ -163,3 +163,9 @@ def test_mistakes_in_the_command_line(words, message, tmp_path):
     words = [word.format(**{name: tmp_path / name for name in texts}) for word in words]
     assert_told_in_one_line(experiment_here(*words, f"--out={tmp_path / 'out'}", tmp_path=tmp_path), message)
     assert not (tmp_path / "out").exists()
+
+
+def test_conditions_of_trainings_with_a_curriculum(tmp_path):
+    """A condition may hold the command: evaluations have no curriculum of commands."""
+    values = {"train": {"commands.curriculum": True}, "conditions": {"stand": {"commands.fixed": [0.0, 0.0, 0.0]}}}
+    assert [*read_matrix(write(tmp_path / "matrix.yaml", SMALL | values)).conditions] == ["stand"]

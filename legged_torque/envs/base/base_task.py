@@ -171,8 +171,11 @@ class BaseTask(VecEnv):
     def keep(self, name: str, tensor: Tensor) -> Tensor:
         """Make a tensor of a task of your own a part of :meth:`world_state_dict`, and return it.
 
-        It has a row per world, and steps write it in place. A UserError if the name is taken. Shape: (num_envs, any).
+        Steps write it in place. Worlds in which it is finite now, but not after a step, begin a new episode. A
+        UserError if the name is taken, or the tensor is not contiguous. Shape: (num_envs, ...).
         """
+        if tensor.shape[:1] != (self.num_envs,) or not tensor.is_contiguous():
+            raise UserError(f"task.keep takes contiguous tensors with a row per world; '{name}' is none")
         if name in self._world_state:
             raise UserError(f"task.keep has '{name}' twice; give the second tensor a name of its own")
         self._world_state[name] = tensor

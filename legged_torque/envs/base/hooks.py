@@ -20,9 +20,16 @@ def check_methods(task: type, base: type, cfg: LeggedRobotCfg) -> None:
     terms = {"_reward_": ("rewards.scales", section_keys(cfg.rewards.scales))}
     terms["_termination_"] = ("terminations", section_keys(cfg.terminations))
     owners = [owner for owner in task.__mro__ if not issubclass(base, owner)]
-    methods = [(name, value) for owner in owners for name, value in vars(owner).items() if inspect.isfunction(value)]
-    used = {used for name, method in methods for used in _names(method.__code__) if used != name}
+    methods = [(name, _code(value)) for owner in owners for name, value in vars(owner).items()]
+    used = {used for name, code in methods if code for used in _names(code) if used != name}
     refuse([problem for owner in owners for problem in _idle(owner, base, terms, used)])
+
+
+def _code(value: object) -> CodeType | None:
+    """Return the code of a method, a property or the like; None of anything else."""
+    for name in ("fget", "func", "__func__"):
+        value = getattr(value, name, value)
+    return getattr(inspect.unwrap(value), "__code__", None)  # type: ignore[arg-type]
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -33,7 +40,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 
 def _idle(owner: type, base: type, terms: dict[str, tuple[str, list[str]]], used: set[str]) -> Iterator[str]:
-    """Yield such methods of a class; helpers are none, whose names are ``used`` in other methods.
+    """Yield such methods of a class; those whose names are ``used`` in others are helpers, and left out.
 
     ``terms`` are section and names of settings by the beginning of methods.
     """

@@ -108,7 +108,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._init_random_events()
         self._init_observations()
         kept = {"actions": self._given_actions, **self.randomization.fields, **self.motors.watched()}
-        kept |= {"random_parameters": self.randomization.values, **self.sensors.watched(), **self._world_state}
+        kept |= {"random_parameters": self.randomization.values, **self.sensors.watched()}
+        kept |= {f"task.{name}": values for name, values in self._world_state.items()}
         self.health = Health(watched(self.state, kept, self.rewards, self.observations), self.sim.diverged)
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
@@ -283,7 +284,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
                 self._final.setdefault(name, torch.zeros_like(values)).copy_(values)
 
     def set_state(self, qpos: Tensor, qvel: Tensor) -> None:
-        """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, and observe them; episodes go on."""
+        """Put all worlds into states as in ``sim.qpos`` and ``sim.qvel``, without contacts yet; episodes go on."""
         self.state.place(qpos, qvel)
         self.command_generator.update()
         self.sensors.begin_episodes(self.state.reset_buf)

@@ -136,7 +136,7 @@ class LeggedRobotCfg(BaseConfig):
         # parameters, resampled at resets and at random; one value per world unless noted
         randomize_parameters: bool = False  # whether parameters are drawn at all
         keep_fixed: list[str] = []  # names of parameters below that are not drawn after all
-        _swept: tuple[str, ...] = ()  # names of the only ones that are drawn, of tasks and motors; see ``draw_only``
+        _swept: tuple[str, ...] = ()  # if set, only these are drawn, those of tasks and motors included
         keep_probability: Share = 0.0  # of draws in which the joints keep their own values of dof_*
         resampling_probability: Share = 0.002  # per control step and world
         trunk_mass: Ranges = {"scale": [0.8, 1.2]}  # [kg]; inertia in proportion
