@@ -118,6 +118,7 @@ def make_runner(make_task):
             "algorithm.num_learning_epochs": 1,
             "algorithm.schedule": "fixed",
             "algorithm.symmetry_cfg.use_data_augmentation": augmentation,
+            "algorithm.symmetry_cfg.use_equivariant_networks": False,
             "algorithm.symmetry_cfg.use_mirror_loss": loss,
         }
         return build_runner(make_task, name, WORLDS, **{**settings, **overrides})

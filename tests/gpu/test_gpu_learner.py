@@ -1,11 +1,14 @@
 """PPO's Triton kernels, compiled for the GPU, in TF32 and bfloat16, against torch's autograd, Adam and formulas."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
 from support.capture import gradient_errors
 from support.rollouts import record_rollout
-from support.wide_ppo import STEPS, assert_steps_are_those_of_torch, build, choose
+from support.wide_ppo import MIRROR, STEPS, assert_steps_are_those_of_torch, build, choose, mirrored
+from tensordict import TensorDict
 
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.sim.graph import CudaGraph
@@ -68,7 +71,7 @@ def test_gradients(device, precision):
     No ratio is clipped: near the limit, rounding would decide. The same test in Triton's interpreter clips them.
     """
     close = TOLERANCES[precision]
-    for kind in ({}, {"multi_head": True, "symmetric": True}):
+    for kind in ({}, {"multi_head": True, "symmetric": "images"}):
         alg = make(device, precision=precision, max_grad_norm=1e9, clip_param=10.0, learning_rate=1e-2, **kind)
         record_rollout(alg)
         graph = CudaGraph(alg.update_minibatch, device)
@@ -89,9 +92,25 @@ def test_steps_are_those_of_torch(device):
     assert_steps_are_those_of_torch(alg, CudaGraph(alg.update_minibatch, device), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("precision", TOLERANCES)
+def test_equivariant_networks(device, precision):
+    """After updates, mirrored observations give mirrored actions and the same values; float64 shows the weights."""
+    alg = make(device, multi_head=True, symmetric="networks", precision=precision)
+    before = alg.tensors()[0].clone()
+    for seed in range(3):
+        record_rollout(alg, seed)
+        assert alg.update()["skipped_updates"] == 0.0
+    assert (alg.tensors()[0] != before).float().mean() > 0.99
+    actor, critic = (copy.deepcopy(model).double().cpu() for model in (alg.actor, alg.critic))
+    obs = TensorDict({name: torch.randn(30, len(MIRROR[name][0])).double() for name in ("policy", "critic")}, [30])
+    images = TensorDict({name: mirrored(name, values) for name, values in obs.items()}, [30])
+    torch.testing.assert_close(actor(images), mirrored("actions", actor(obs)), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(critic(images), critic(obs), rtol=1e-9, atol=1e-9)
+
+
 def test_a_bad_sample_changes_nothing(device):
     """Of its minibatch nothing is learned, to the bit; the next one is learned from as if it had never been."""
-    spoiled, healthy = (make(device, multi_head=True, symmetric=True) for _ in range(2))
+    spoiled, healthy = (make(device, multi_head=True, symmetric="images") for _ in range(2))
     for alg in (spoiled, healthy):
         record_rollout(alg)
     spoiled.storage.returns[0, 2] = torch.nan
@@ -111,7 +130,7 @@ def test_the_same_bits_twice(device):
     """Rollouts and updates repeat to the bit, replayed or not, with the training's precision if there is a GPU."""
     states = []
     for replays in (True, True, False):
-        alg = make(device, multi_head=True, symmetric=True, precision="TF32" if device == "cpu" else "bfloat16")
+        alg = make(device, multi_head=True, symmetric="images", precision="TF32" if device == "cpu" else "bfloat16")
         alg.update_graph.enabled = replays
         record_rollout(alg)
         alg.update()

@@ -42,7 +42,7 @@ def test_it_learns_to_hold_point_masses():
     torch.manual_seed(0)
     faster = ("flashsac.learning_rate_peak=2e-3", "flashsac.critic_target_update_tau=0.05")
     trainer = make("flashsac.critic.num_bins=51", *faster)
-    assert_holds_points(trainer, within=0.3)
+    assert_holds_points(trainer, within=0.5)
 
 
 def test_losses():

@@ -34,7 +34,7 @@ def pair(seed=3, **settings):
     return plain, fused
 
 
-KINDS = [{}, {"multi_head": True, "symmetric": True}]
+KINDS = [{}, {"multi_head": True, "symmetric": "images"}]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=str)
@@ -49,7 +49,11 @@ def test_rollout_is_that_of_rsl_rl(kind):
     torch.testing.assert_close(fused.action_std(), plain.action_std()[0])
 
 
-@pytest.mark.parametrize("kind", [{}, KINDS[1] | {"std_type": "scalar", "use_clipped_value_loss": False}], ids=str)
+EQUIVARIANT = {"multi_head": True, "symmetric": "networks"}
+SCALAR = {"std_type": "scalar", "use_clipped_value_loss": False}
+
+
+@pytest.mark.parametrize("kind", [{}, KINDS[1] | SCALAR, EQUIVARIANT], ids=str)
 def test_gradients_are_those_of_autograd(kind):
     """Of all parameters, for a policy that has moved since it acted, so that ratios and values are clipped too."""
     settings = {"max_grad_norm": 1e9, "clip_param": 0.02, "learning_rate": 1e-2, "entropy_coef": 0.1, **kind}
@@ -185,7 +189,7 @@ def test_what_has_no_kernels_is_left_to_torch():
         assert not has_kernels(alg), name
     for settings in ({"obs_normalization": True}, {"normalize_advantage_per_mini_batch": True}):
         assert not has_kernels(make_ppo(**settings))
-    alg = make(OnDevicePPO, symmetric=True, use_mixed_precision=True)
+    alg = make(OnDevicePPO, symmetric="images", use_mixed_precision=True)
     assert alg.product_dtype == torch.float32
     alg.symmetry.use_mirror_loss = True
     assert not has_kernels(alg)

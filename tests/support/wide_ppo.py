@@ -15,8 +15,14 @@ WIDE, NARROW = ([72, 136], [200, 24, 16]), ([24], [40])  # hidden layers of acto
 MIRROR = {  # an order that is its own inverse, and signs
     "policy": ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, 1.0, 1.0]),
     "critic": ([1, 0, 2, 4, 3, 5, 6], [1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0]),
-    "actions": ([3, 4, 5, 0, 1, 2], [-1.0, 1.0, 1.0, -1.0, 1.0, 1.0]),
+    "actions": ([1, 0, 2, 4, 3, 5], [-1.0, -1.0, 1.0, 1.0, 1.0, -1.0]),  # positions and torques each by themselves
 }
+
+
+def mirrored(name, values):
+    """The mirror image of observations or actions. Shape: (samples, size)."""
+    order, signs = MIRROR[name]
+    return values[:, order] * torch.tensor(signs)
 
 
 class Mirrored:
@@ -31,8 +37,11 @@ class Mirrored:
         self.mirror.maps = self.maps
 
 
-def build(kind, device="cpu", multi_head=False, symmetric=False, seed=0, std_type="log", sizes=WIDE, **settings):
-    """An algorithm of a kind, which gets actor, critic, storage and settings."""
+def build(kind, device="cpu", multi_head=False, symmetric="", seed=0, std_type="log", sizes=WIDE, **settings):
+    """An algorithm of a kind, which gets actor, critic, storage and settings.
+
+    ``symmetric``: "images" to learn from mirror images, or "networks" that are equivariant.
+    """
     torch.manual_seed(seed)
     distribution = {"class_name": GaussianDistribution, "init_std": 0.7, "std_type": std_type}
     obs, groups = random_obs(WORLDS).to(device), {"actor": ["policy"], "critic": ["critic"]}
@@ -44,6 +53,7 @@ def build(kind, device="cpu", multi_head=False, symmetric=False, seed=0, std_typ
         function = "legged_torque.envs.base.symmetry:with_mirror_images"
         settings["symmetry_cfg"] = {"data_augmentation_func": function, "use_data_augmentation": True}
         settings["symmetry_cfg"] |= {"use_mirror_loss": False, "env": Mirrored(device)}
+        settings["symmetry_cfg"]["use_equivariant_networks"] = symmetric == "networks"
     return kind(actor, critic, storage, **{**SETTINGS, "device": device, **settings})
 
 

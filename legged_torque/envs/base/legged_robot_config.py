@@ -379,6 +379,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
 
         class symmetry_cfg:  # learning from mirror images as well, with rsl_rl's names
             use_data_augmentation: bool = False  # whether minibatches hold mirror images as well
+            use_equivariant_networks: bool = True  # where possible instead: the same, from half the samples
             use_mirror_loss: bool = False  # whether actions that are not mirror images cost
             mirror_loss_coeff: NotNegative = 0.1  # weight of that loss
             data_augmentation_func: str = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them

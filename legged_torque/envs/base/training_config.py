@@ -28,7 +28,9 @@ READ = {
     PPO: _OF_PPO,
     FLASHSAC: (
         "flashsac.",
-        *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision", "symmetry_cfg.")),
+        *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision")),
+        *(f"algorithm.symmetry_cfg.{name}" for name in ("use_data_augmentation", "data_augmentation_func")),
+        "algorithm.symmetry_cfg.use_mirror_loss",  # which it refuses
     ),
     DISTILLATION: ("distillation.", "algorithm.class_name"),
 }
@@ -67,6 +69,14 @@ class TrainingCfg(BaseConfig):
         scale_changes(env_cfg, changes.pop("linear_changes", 1.0))
         for section, values in changes.items():
             update_from_dict(env_cfg if section in section_keys(env_cfg) else self, {section: values})
+
+    def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Return the settings of a run in today's layout: without ``use_equivariant_networks``, it had none."""
+        algorithm = values.get("algorithm")
+        if not isinstance(algorithm, dict) or not isinstance(algorithm.get("symmetry_cfg"), dict):
+            return values
+        mirroring = {"use_equivariant_networks": False, **algorithm["symmetry_cfg"]}
+        return {**values, "algorithm": {**algorithm, "symmetry_cfg": mirroring}}
 
     def set_clock(self, ratio: float) -> None:
         """Let discounts and evaluations be of the same time with ``ratio`` control steps in place of one."""

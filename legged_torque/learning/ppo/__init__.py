@@ -7,8 +7,7 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 
 from legged_torque.envs.base.symmetry import with_mirror_images
-from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.multi_head import MultiHeadModel
+from legged_torque.learning.equivariance import are_known
 from legged_torque.learning.ppo.cpu_ppo import CpuPPO
 from legged_torque.learning.ppo.torch_ppo import LOSS_NAMES as LOSS_NAMES
 from legged_torque.learning.ppo.torch_ppo import TorchPPO
@@ -35,13 +34,11 @@ class OnDevicePPO(TorchPPO):
 
 def has_kernels(alg: TorchPPO) -> bool:
     """Return whether Triton's kernels and :class:`CpuPPO` know all parts of an algorithm; they know no user's class."""
-    models, symmetry = (alg.actor, alg.critic), alg.symmetry
+    symmetry = alg.symmetry
     return (
         type(alg) is OnDevicePPO
-        and all(type(model) in (MLPModel, MultiHeadModel) for model in models)
-        and type(alg.actor.distribution) is GaussianDistribution
-        and all(read_network(model.mlp) and not model.obs_normalization for model in models)
-        and all(parameter.requires_grad for model in models for parameter in model.parameters())
+        and are_known(alg.actor, alg.critic)
+        and all(read_network(model.mlp) for model in (alg.actor, alg.critic))
         and not alg.normalize_advantage_per_mini_batch
         and not (symmetry and symmetry.use_mirror_loss)
         and not (symmetry and symmetry.data_augmentation_func is not with_mirror_images)

@@ -7,10 +7,14 @@ import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
+from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 
+from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.checkpoint import cloned
+from legged_torque.learning.equivariance import MirroredWeights, are_known
 from legged_torque.learning.protocols import Transition, annealed
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.utils import distributed
@@ -29,7 +33,8 @@ class TorchPPO(PPO):
     leaves the networks and the optimizer untouched and is counted. If a weight or a moment is not finite after an
     iteration, all its minibatches are undone and counted. Processes that train together learn from minibatches
     of their own and average gradients and KL divergence, so that all of them take the same step or skip it. As in
-    rsl_rl, each normalizes the advantages of its own rollout.
+    rsl_rl, each normalizes the advantages of its own rollout. Networks may be equivariant, in place of learning from
+    mirror images.
 
     Attributes:
         warm_up_iterations: Iterations at the start of a training in which only the critic learns.
@@ -37,6 +42,7 @@ class TorchPPO(PPO):
         indices: Those of the minibatch that is learned from. Shape: (batch_size,), int64.
         update_graph: An epoch, which takes a gradient step on each minibatch of ``order``.
         product_dtype: Numbers that matrix products take; those of float32 may be TF32.
+        mirrored: The mirror image of all parameters, of equivariant networks; else None.
     """
 
     capturable = True
@@ -65,8 +71,11 @@ class TorchPPO(PPO):
             raise UserError(f"{type(self).__name__} does not support algorithm.rnd_cfg")
         if actor.is_recurrent or critic.is_recurrent:
             raise UserError(f"{type(self).__name__} does not support recurrent models")
-        symmetry = kwargs.pop("symmetry_cfg", None)
-        if symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
+        symmetry = dict(kwargs.pop("symmetry_cfg", None) or {})
+        self.mirrored: MirroredWeights | None = None
+        if symmetry.pop("use_equivariant_networks", False) and replaces_images(symmetry, actor, critic):
+            self.mirrored = MirroredWeights(actor, critic, symmetry["env"].mirror.maps)
+        elif symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         self.batch_size = max(storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches, 1)
@@ -77,6 +86,10 @@ class TorchPPO(PPO):
         self.entropy_weight = torch.tensor(self.entropy_coef, device=self.device)
         self._parts = [list(model.parameters()) for model in (self.actor, self.critic)]  # each is clipped by itself
         self._parameters = [*self._parts[0], *self._parts[1]]
+        if self.mirrored:
+            weights = self.mirrored.symmetric(parameters_to_vector(self._parameters))
+            for parameter, part in zip(self._parameters, self._split(weights), strict=True):
+                parameter.data.copy_(part)
         make_optimizer = type(self.optimizer)
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
@@ -92,6 +105,8 @@ class TorchPPO(PPO):
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
         """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
         algorithm = {**cfg["algorithm"], "class_name": cls.make}
+        if cfg["pretraining"]["function"]:  # whose networks are not equivariant
+            algorithm["symmetry_cfg"] = {**algorithm["symmetry_cfg"], "use_equivariant_networks": False}
         alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
         alg.update_graph.enabled = cfg["capture"]
         alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
@@ -198,14 +213,22 @@ class TorchPPO(PPO):
         return {**means, **policy, "all_skipped": updates <= 0}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load as rsl_rl does, and keep the learning rate the tensor that it was."""
+        """Load as rsl_rl does, check the weights, and keep the learning rate the tensor that it was."""
         learning_rate = self.learning_rate
         load_iteration = super().load(loaded_dict, load_cfg, strict)
+        self.check_weights()
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
+
+    def check_weights(self) -> None:
+        """Raise a UserError if networks that have to be equivariant are not, such as those of other settings."""
+        weights = parameters_to_vector(self._parameters)
+        if self.mirrored and not torch.allclose(self.mirrored.averaged(weights), weights, atol=1e-3):
+            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
+            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
@@ -269,6 +292,10 @@ class TorchPPO(PPO):
         for parameter in self._parameters:  # as zero_grad() does, which takes longer
             parameter.grad = None
         loss.backward()
+        if self.mirrored:
+            gradient = torch.cat([parameter.grad.flatten() for parameter in self._parameters])
+            for parameter, part in zip(self._parameters, self._split(self.mirrored.averaged(gradient)), strict=True):
+                parameter.grad = part
         if self.is_multi_gpu:
             distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
         if self.schedule == "adaptive":
@@ -284,6 +311,11 @@ class TorchPPO(PPO):
         numbers = torch.cat([numbers, torch.stack([gradient_norm, norms[1]])])
         kept = torch.where(self._skip.bool(), 0.0, numbers)
         self.losses += torch.cat([kept, self._skip.unsqueeze(0)])
+
+    def _split(self, values: Tensor) -> list[Tensor]:
+        """Return numbers, one per parameter, in the shapes of the parameters."""
+        parts = values.split([parameter.numel() for parameter in self._parameters])
+        return [part.view_as(parameter) for part, parameter in zip(parts, self._parameters, strict=True)]
 
     def _gather(self) -> RolloutStorage.Batch:
         """Return the samples of ``indices`` from the stored rollout."""
@@ -313,3 +345,10 @@ class TorchPPO(PPO):
     def _pick(self, tensor: Tensor) -> Tensor:
         """Return the rows of ``indices`` of what is stored for all steps and worlds."""
         return tensor.flatten(0, 1).index_select(0, self.indices)
+
+
+def replaces_images(symmetry: dict[str, Any], actor: MLPModel, critic: MLPModel) -> bool:
+    """Return whether equivariant networks can replace the mirror images that settings want."""
+    wanted = symmetry["use_data_augmentation"] and not symmetry["use_mirror_loss"]
+    is_ours = resolve_callable(symmetry["data_augmentation_func"]) is with_mirror_images
+    return wanted and is_ours and are_known(actor, critic)
