@@ -42,6 +42,10 @@ class MirroredWeights:
         """Return the mean of numbers, one per parameter, and of their mirror image."""
         return torch.addcmul(values, values.index_select(0, self.order), self.signs).mul_(0.5)
 
+    def is_symmetric(self, values: Tensor) -> bool:
+        """Return whether numbers are their own mirror image, up to rounding."""
+        return torch.allclose(self.averaged(values), values, atol=1e-3)
+
     def symmetric(self, values: Tensor) -> Tensor:
         """Return numbers of which one half is kept, and the other half becomes its mirror image."""
         places = torch.arange(len(self.order), device=self.order.device)

@@ -53,10 +53,10 @@ def gradient_errors(alg):
     alg.optimizer.zero_grad()
     with torch.enable_grad():
         alg.loss()[0].backward()
-    errors, start = {}, 0
-    for name, network in {"actor": alg.actor, "critic": alg.critic}.items():
-        exact = parameters_to_vector(parameter.grad for parameter in network.parameters())
-        count = len(list(network.parameters()))
-        ours = parameters_to_vector(found[start : start + count])
-        errors[name], start = float((ours - exact).norm() / exact.norm()), start + count
-    return errors
+    exact = parameters_to_vector(parameter.grad for parameter in [*alg.actor.parameters(), *alg.critic.parameters()])
+    if alg.mirrored:
+        exact = alg.mirrored.averaged(exact)
+    sizes = [sum(parameter.numel() for parameter in network.parameters()) for network in (alg.actor, alg.critic)]
+    parts = zip(parameters_to_vector(found).split(sizes), exact.split(sizes), strict=True)
+    errors = (float((ours - expected).norm() / expected.norm()) for ours, expected in parts)
+    return dict(zip(("actor", "critic"), errors, strict=True))

@@ -1,5 +1,6 @@
 """rsl_rl's PPO with an update that runs on the device from end to end."""
 
+import contextlib
 from itertools import zip_longest
 from typing import Any
 
@@ -74,8 +75,9 @@ class TorchPPO(PPO):
         symmetry = dict(kwargs.pop("symmetry_cfg", None) or {})
         self.mirrored: MirroredWeights | None = None
         if symmetry.pop("use_equivariant_networks", False) and replaces_images(symmetry, actor, critic):
-            self.mirrored = MirroredWeights(actor, critic, symmetry["env"].mirror.maps)
-        elif symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
+            with contextlib.suppress(UserError):  # of an unknown mirror image, without which nobody can train
+                self.mirrored = MirroredWeights(actor, critic, symmetry["env"].mirror.maps)
+        if not self.mirrored and symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
         self.batch_size = max(storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches, 1)
@@ -213,22 +215,21 @@ class TorchPPO(PPO):
         return {**means, **policy, "all_skipped": updates <= 0}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Load as rsl_rl does, check the weights, and keep the learning rate the tensor that it was."""
+        """Load as rsl_rl does, and keep the learning rate the tensor that it was.
+
+        A UserError if learning goes on with equivariant networks and those of the checkpoint are not.
+        """
         learning_rate = self.learning_rate
         load_iteration = super().load(loaded_dict, load_cfg, strict)
-        self.check_weights()
+        weights = parameters_to_vector(self._parameters)
+        if load_cfg is None and self.mirrored and not self.mirrored.is_symmetric(weights):
+            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
+            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
         self.update_graph.reset()  # the optimizer's tensors are new
         return load_iteration
-
-    def check_weights(self) -> None:
-        """Raise a UserError if networks that have to be equivariant are not, such as those of other settings."""
-        weights = parameters_to_vector(self._parameters)
-        if self.mirrored and not torch.allclose(self.mirrored.averaged(weights), weights, atol=1e-3):
-            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
-            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
 
     def action_std(self) -> Tensor:
         """Return the standard deviations of the actions that were sampled last. Shape: (..., num_actions)."""
