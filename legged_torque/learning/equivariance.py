@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from legged_torque.learning.distribution import GaussianDistribution
 from legged_torque.learning.multi_head import MultiHeadMLP, MultiHeadModel
+from legged_torque.utils.errors import UserError
 
 Map = tuple[Tensor, Tensor]
 """Order and signs of a mirror image: entry i becomes sign i times entry order i."""
@@ -28,7 +29,10 @@ class MirroredWeights:
     """
 
     def __init__(self, actor: MLPModel, critic: MLPModel, maps: Mapping[str, Map]) -> None:
-        """Take the mirror images of groups of observations and of "actions", as :class:`Mirror` has them."""
+        """Take the mirror images of groups of observations and of "actions", as a task's ``mirror.maps``.
+
+        A UserError if that of a position is a torque of a multi-head actor, whose weights then have none.
+        """
         actions, value = maps["actions"], _kept(1, maps["actions"])
         self.order, self.signs = _joined(
             [
@@ -55,7 +59,7 @@ class MirroredWeights:
 
 
 def are_known(actor: MLPModel, critic: MLPModel) -> bool:
-    """Return whether actor and critic are of classes whose parameters are known, all of which learn; no user's are."""
+    """Return whether all parameters of actor and critic are known and learn; those of a user's classes are not."""
     models = (actor, critic)
     return (
         all(type(model) in (MLPModel, MultiHeadModel) and type(model.mlp) in (MLP, MultiHeadMLP) for model in models)
@@ -70,6 +74,8 @@ def _model_maps(model: MLPModel, inputs: Map, outputs: Map) -> list[Map]:
     network = model.mlp
     if isinstance(network, MultiHeadMLP):
         size = len(outputs[0]) // 2
+        if bool((outputs[0][:size] >= size).any()):
+            raise UserError("the mirror images of positions are torques")
         positions = outputs[0][:size], outputs[1][:size]
         torques = outputs[0][size:] - size, outputs[1][size:]
         features = _reversed(network.position_head[0].in_features, outputs)
@@ -95,7 +101,7 @@ def _layer_maps(network: MLP, inputs: Map, outputs: Map) -> dict[Tensor, Map]:
 
 
 def _kept(size: int, like: Map) -> Map:
-    """Return the mirror image of numbers that it leaves as they are."""
+    """Return a mirror image that changes nothing."""
     return torch.arange(size, device=like[0].device), like[1].new_ones(size)
 
 

@@ -27,6 +27,12 @@ class Mirroring:
             order += [start + place for place in part.order]
         return cls(tuple(order), tuple(sign for part in parts for sign in part.signs))
 
+    def is_its_own_inverse(self) -> bool:
+        """Return whether mirroring twice changes nothing."""
+        places = range(len(self.order))
+        twice = [(self.order[place], self.signs[i] * self.signs[place]) for i, place in enumerate(self.order)]
+        return twice == [(i, 1.0) for i in places]
+
     def unsigned(self) -> "Mirroring":
         """Return the same permutation of values that keep their signs, such as masses."""
         return Mirroring(self.order, (1.0,) * len(self.order))

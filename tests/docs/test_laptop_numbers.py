@@ -1,10 +1,10 @@
 """Numbers in the documents of the preset laptop, against the data."""
 
-import json
 from itertools import product
 
 import numpy as np
 import pandas as pd
+from scipy import stats
 from support.documents import DOCS, rows_of, same, text_of
 
 from legged_torque.envs import task_registry
@@ -37,7 +37,7 @@ def test_few_worlds():
     """Mean and latest of the steps after which evaluations track 70%, and how many seeds come there."""
     data, walking = laptop_settings()
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 5 and data[SETTINGS].drop_duplicates().shape[0] == 59
+    assert len(rows) == 5 and data[SETTINGS].drop_duplicates().shape[0] == 65
     seeds = data.groupby([*SETTINGS, "task"])["seed"].nunique()
     for size, batches, epochs, *cells, _ in rows:
         shape, _, others = size.partition(", ")
@@ -108,15 +108,50 @@ def test_half_of_the_mirror_images():
     before = evaluations.groupby(["task", "seed"]).apply(at_the_end)
     changes = (ends - before).dropna()
     assert len(ends) == 12 and len(changes) == 9 and -0.015 < changes.mean() < -0.005
-    assert "ends 0.01 lower (9 pairs)" in text
+    assert "ended 0.01 lower (9 pairs)" in text
     curves, before = (rows[rows["track_percentage"] >= 0.7] for rows in (curves, evaluations))
     first, second = (rows.groupby(["task", "seed"])["steps"].min() for rows in (curves, before))
     ratio = np.exp(np.log(first / second).dropna().mean())
-    assert f"needs about {ratio:.1f} times the steps" in text
-    measured = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
-    rows = [row for each in measured if each.get("commit") == "20c226a" for row in each["rows"]]
-    ms = [row["update_ms"] for images in ("half", "all") for row in rows[::2] if row["images"] == images]
-    assert f"update takes [{ms[0]:.1f} instead of {ms[1]:.1f} ms]" in text
+    assert f"needed about {ratio:.1f} times the steps" in text
+
+
+def test_equivariant_networks():
+    """How many times the steps they take, and what tracking they end at, of laptop and default preset."""
+    data, _ = laptop_settings()
+    data = data[data["task"].isin(data["task"].unique()[:3])]
+    data["other"], whole = data["other"].str.removesuffix(" 20M"), data["other"].str.endswith(" 20M")
+
+    def steps_to(share, other, epochs=5):
+        runs = data[(data["other"] == other) & (data["epochs"] == epochs)]
+        walks = runs[(runs["track_percentage"] >= share) & (runs["steps"] < 7.6e6)]
+        steps = walks.groupby(["task", "seed"])["steps"].min() / 1e6
+        return np.log(steps.reindex([*runs.groupby(["task", "seed"]).groups]).fillna(7.5))
+
+    before = {share: steps_to(share, "networks 128") for share in (0.7, 0.8)}
+    pairs = [
+        (steps_to(share, "equivariant 128", epochs) - before[share]).dropna() for epochs in (5, 7) for share in before
+    ]
+    assert [len(pair) for pair in pairs] == [24, 24, 12, 12]
+    text = text_of("tried.md", "**Equivariant networks in place").replace("\n", " ")
+    said = "needs {:.2f} times the steps to 70%, {:.2f} times those to 80% (24 pairs), with 7 epochs {:.2f} and {:.2f}"
+    assert said.format(*(np.exp(pair.mean()) for pair in pairs)) in text
+    ends = data[whole].groupby(["other", "task", "seed"]).apply(at_the_end)
+    ends = [ends[f"{kind} 128"] for kind in ("equivariant", "networks")]
+    assert [len(of) for of in ends] == [12, 12]
+    assert "ends at {:.3f} instead of {:.3f} (12 trainings each)".format(*(of.mean() for of in ends)) in text
+    curves = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('equivariant/')")
+    robots = pd.read_csv(DOCS / "results" / "robots.csv.xz").query("trained == 'ideal motors, no latency'")
+    evaluations = pd.read_csv(DOCS / "results" / "evaluations.csv.xz").query("environment == 'low'")
+    both = [runs.groupby(["task", "seed"]) for runs in (curves, pd.concat([evaluations, robots]))]
+    changes = (both[0].apply(at_the_end) - both[1].apply(at_the_end)).dropna()
+    multi_head = changes.index.get_level_values("task").str.endswith("torque_multihead")
+    chances = [stats.ttest_1samp(changes[of], 0.0).pvalue for of in (multi_head, ~multi_head)]
+    said = f"tracks {-changes[multi_head].mean():.3f} less (A1, Go2; {multi_head.sum()} pairs, p = {chances[0]:.3f})"
+    assert (
+        f"{said}, others {changes[~multi_head].mean():.3f} more ({(~multi_head).sum()}, p = {chances[1]:.2f})" in text
+    )
+    first, second = (runs.apply(lambda run: run[run["track_percentage"] >= 0.7]["steps"].min()) for runs in both)
+    assert f"70% takes {np.exp(np.log(first / second).dropna().mean()):.2f} times the steps" in text
 
 
 def after(seconds):
@@ -150,7 +185,8 @@ def test_laptop():
         f"tracked {flash['track_percentage']:.2f} after {flash['steps']:,.0f} steps and {flash['seconds'] / 60:.0f} min"
     )
     assert said in text_of("howto/learner.md", "- On two cores of a")
-    data = data[~data["task"].str.endswith("flashsac")]
+    before = data[data["commit"] == "d8439d6"].iloc[-1]
+    data = data[~data["task"].str.endswith("flashsac") & (data["commit"] != "d8439d6")]
     slow, on_xeon = data["commit"] == "9109b7f", data["commit"].isin(["db0ae3b", "a2590d6", "9109b7f"])
     walks = data[on_xeon & (data["track_percentage"] >= 0.7)].groupby([slow, "task", "seed"])["seconds"].min()
     walked, slower = walks[False], after(walks[True]["go2_torque_multihead"])
@@ -163,9 +199,19 @@ def test_laptop():
         assert len(walked[task]) == 4
     assert f"`a1_torque_multihead` {after(walked['a1_torque_multihead'])[0]} (a2590d6), the Go2" in text
     assert "on a slower one {} and {} (9109b7f)".format(*slower) in text
+    on_epyc = data["commit"] == "48af7cf"
+    last = data[on_epyc].groupby("task")[["steps", "seconds"]].max()
+    walks = [
+        data[on_epyc & (data["track_percentage"] >= share)].groupby("task")["seconds"].min() for share in (0.7, 0.8)
+    ]
+    assert "A1 tracked 70 and 80% after {} and {}, the".format(*after(w["a1_torque_multihead"] for w in walks)) in text
+    assert f"the Go2 70% after {after(walks[0][['go2_torque_multihead']])[0]} (" in text and len(walks[1]) == 1
+    speeds = [*(last["steps"] / last["seconds"]), before["steps"] / before["seconds"]]
+    said = "made {:,.0f} and {:,.0f} steps/s, d8439d6 with 128 worlds and networks of [128, 128] {:,.0f}."
+    assert said.format(*(round(speed, -2) for speed in speeds)) in text
     _, rows = rows_of("getting_started.md", "task")
     for task, *cells in rows:
-        of_task = data[(data["task"] == task.strip("`")) & ~on_xeon]
+        of_task = data[(data["task"] == task.strip("`")) & ~on_xeon & ~on_epyc]
         for share, cell in zip((0.7, 0.8), cells, strict=True):
             seconds = of_task[of_task["track_percentage"] >= share].groupby("seed")["seconds"].min()
             assert list(seconds.index) == [1, 2, 3, 4] and cell == ", ".join(after(seconds)), (task, share)

@@ -37,7 +37,11 @@ OF_STUDENT = [
     "--set=distillation.num_mini_batches=2",
 ]
 MAP = {"terrain.num_rows": 1, "terrain.num_cols": 4, "terrain.max_init_terrain_level": 0}
-OF_STUDENT += ["--set=distillation.student.rnn_hidden_dim=8", "--set=distillation.student.hidden_dims=[8]"]
+OF_STUDENT += [
+    "--set=env.history_length=2",
+    "--set=distillation.student.rnn_hidden_dim=8",
+    "--set=distillation.student.hidden_dims=[8]",
+]
 
 
 class Wise(nn.Module):

@@ -6,15 +6,17 @@ from rsl_rl.models import MLPModel
 from support.rollouts import parameters, record_rollout
 from support.runners import build_runner
 from support.symmetry import mirror_joints, mirror_policy
-from support.wide_ppo import MIRROR, build, choose, mirrored
+from support.wide_ppo import MIRROR, Mirrored, build, choose, mirrored
 from tensordict import TensorDict
 
 from legged_torque.envs import task_registry
-from legged_torque.learning.equivariance import are_known
+from legged_torque.envs.base.symmetry import Mirror
+from legged_torque.learning.equivariance import MirroredWeights, are_known
 from legged_torque.learning.ppo import OnDevicePPO
 from legged_torque.learning.ppo.cpu_ppo import CpuPPO
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.mirroring import SCALAR, Mirroring
 
 SYMMETRY = "algorithm.symmetry_cfg."
 SMALL = {"actor.hidden_dims": [15, 8], "critic.hidden_dims": [9], "runner.logger": "none"}
@@ -64,7 +66,7 @@ def test_the_same_is_learned_from_half_of_the_samples(kind, multi_head):
 
 
 def test_they_stay_equivariant():
-    """After many steps of Adam, and with weights that were drawn at random half of which were kept."""
+    """After many steps of Adam; initial weights have the usual spread."""
     alg, drawn = build(OnDevicePPO, symmetric="networks", **ODD), build(OnDevicePPO, **ODD)
     spread, expected = (float(one.actor.mlp[0].weight.detach().std()) for one in (alg, drawn))
     assert spread == pytest.approx(expected, rel=0.2)
@@ -87,9 +89,27 @@ def test_networks_of_a_user(part):
     assert not are_known(alg.actor, alg.critic)
 
 
+class Own(OnDevicePPO):
+    """A PPO of a user, which may take other gradient steps."""
+
+
+def test_mirror_images_that_have_no_weights():
+    """Those of positions may not be torques of a multi-head actor, and mirroring twice changes nothing."""
+    alg, maps = build(OnDevicePPO, multi_head=True), Mirrored("cpu").maps
+    assert len(MirroredWeights(alg.actor, alg.critic, maps).order) == sum(map(torch.numel, alg._parameters))
+    maps["actions"] = torch.tensor([3, 4, 5, 0, 1, 2]), torch.ones(6)
+    with pytest.raises(UserError, match="the mirror images of positions are torques"):
+        MirroredWeights(alg.actor, alg.critic, maps)
+    for mirroring in (Mirroring((1, 2, 0), (1.0, 1.0, 1.0)), Mirroring((1, 0), (1.0, -1.0))):
+        with pytest.raises(UserError, match="mirrored twice, 'wheels' in 'policy' is not what it was"):
+            Mirror({"policy": [("height", SCALAR), ("wheels", mirroring)]}, "", "cpu")
+
+
 @pytest.mark.parametrize(
     ("changes", "has_images"),
     [
+        ({"algorithm.class_name": f"{__name__}:Own"}, True),
+        ({"pretraining.function": "legged_torque.paper.gravity.pretraining:pretrain"}, True),
         ({SYMMETRY + "use_equivariant_networks": False}, True),
         ({SYMMETRY + "use_mirror_loss": True}, True),
         ({SYMMETRY + "use_data_augmentation": False}, False),

@@ -39,10 +39,10 @@ def make(*changes, folder=None):
 
 def test_it_learns_to_hold_point_masses():
     """Its policy drives every point to 0, from which it was anywhere before."""
-    torch.manual_seed(0)
+    torch.manual_seed(1)
     faster = ("flashsac.learning_rate_peak=2e-3", "flashsac.critic_target_update_tau=0.05")
     trainer = make("flashsac.critic.num_bins=51", *faster)
-    assert_holds_points(trainer, within=0.5)
+    assert_holds_points(trainer, within=0.3)
 
 
 def test_losses():

@@ -377,9 +377,9 @@ class LeggedRobotCfgPPO(TrainingCfg):
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
         use_mixed_precision: bool = True  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32
 
-        class symmetry_cfg:  # learning from mirror images as well, with rsl_rl's names
+        class symmetry_cfg:  # learning from mirror images as well, mostly with rsl_rl's names
             use_data_augmentation: bool = False  # whether minibatches hold mirror images as well
-            use_equivariant_networks: bool = True  # where possible instead: the same, from half the samples
+            use_equivariant_networks: bool = True  # instead, where known: networks that mirror actions
             use_mirror_loss: bool = False  # whether actions that are not mirror images cost
             mirror_loss_coeff: NotNegative = 0.1  # weight of that loss
             data_augmentation_func: str = "legged_torque.envs.base.symmetry:with_mirror_images"  # what makes them

@@ -91,7 +91,7 @@ class Mirror:
         """Prepare the permutations.
 
         ``parts`` are, for each kind of vector, its terms by name, one behind the other. A UserError says which mirror
-        image is not known, or the ``problem``, why the robot is not symmetric.
+        image is not known or not its own inverse, or the ``problem``, why the robot is not symmetric.
         """
         self.maps: dict[str, tuple[Tensor, Tensor]] = {}
         for kind, terms in parts.items():
@@ -99,6 +99,8 @@ class Mirror:
                 if mirroring is None:
                     reason = problem or f"the mirror image of '{name}' in '{kind}' is not known"
                     raise UserError(f"algorithm.symmetry_cfg: {reason}")
+                if not mirroring.is_its_own_inverse():
+                    raise UserError(f"mirrored twice, '{name}' in '{kind}' is not what it was")
             whole = Mirroring.joined([mirroring for _, mirroring in terms if mirroring])
             self.maps[kind] = torch.tensor(whole.order, device=device), torch.tensor(whole.signs, device=device)
 

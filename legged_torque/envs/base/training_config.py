@@ -30,7 +30,6 @@ READ = {
         "flashsac.",
         *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision")),
         *(f"algorithm.symmetry_cfg.{name}" for name in ("use_data_augmentation", "data_augmentation_func")),
-        "algorithm.symmetry_cfg.use_mirror_loss",  # which it refuses
     ),
     DISTILLATION: ("distillation.", "algorithm.class_name"),
 }
@@ -71,7 +70,7 @@ class TrainingCfg(BaseConfig):
             update_from_dict(env_cfg if section in section_keys(env_cfg) else self, {section: values})
 
     def upgraded(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Return the settings of a run in today's layout: without ``use_equivariant_networks``, it had none."""
+        """Return the settings of a run in today's layout; one that lacks ``use_equivariant_networks`` used none."""
         algorithm = values.get("algorithm")
         if not isinstance(algorithm, dict) or not isinstance(algorithm.get("symmetry_cfg"), dict):
             return values

@@ -111,7 +111,7 @@ class FlashSAC:
         """Build the learner from settings in rsl_rl's layout; a UserError names one that is not supported."""
         settings, groups, algorithm = cfg["flashsac"], cfg["obs_groups"], cfg["algorithm"]
         mirroring = dict(algorithm["symmetry_cfg"])
-        del mirroring["use_equivariant_networks"]  # of PPO
+        mirroring.pop("use_equivariant_networks", None)  # of PPO
         if cfg["pretraining"]["function"]:
             raise UserError("FlashSAC does not support pretraining.function: it starts from random networks")
         if mirroring["use_mirror_loss"]:

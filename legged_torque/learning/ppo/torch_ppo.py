@@ -75,7 +75,7 @@ class TorchPPO(PPO):
         symmetry = dict(kwargs.pop("symmetry_cfg", None) or {})
         self.mirrored: MirroredWeights | None = None
         if symmetry.pop("use_equivariant_networks", False) and replaces_images(symmetry, actor, critic):
-            with contextlib.suppress(UserError):  # of an unknown mirror image, without which nobody can train
+            with contextlib.suppress(UserError):  # an unknown mirror image is reported when training starts
                 self.mirrored = MirroredWeights(actor, critic, symmetry["env"].mirror.maps)
         if not self.mirrored and symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
@@ -107,7 +107,8 @@ class TorchPPO(PPO):
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
         """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
         algorithm = {**cfg["algorithm"], "class_name": cls.make}
-        if cfg["pretraining"]["function"]:  # whose networks are not equivariant
+        is_ours = cls.__module__.startswith("legged_torque.")  # a user's class may take gradient steps of its own
+        if cfg["pretraining"]["function"] or not is_ours:  # pre-trained networks are not equivariant
             algorithm["symmetry_cfg"] = {**algorithm["symmetry_cfg"], "use_equivariant_networks": False}
         alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
         alg.update_graph.enabled = cfg["capture"]
@@ -293,12 +294,12 @@ class TorchPPO(PPO):
         for parameter in self._parameters:  # as zero_grad() does, which takes longer
             parameter.grad = None
         loss.backward()
+        if self.is_multi_gpu:
+            distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
         if self.mirrored:
             gradient = torch.cat([parameter.grad.flatten() for parameter in self._parameters])
             for parameter, part in zip(self._parameters, self._split(self.mirrored.averaged(gradient)), strict=True):
                 parameter.grad = part
-        if self.is_multi_gpu:
-            distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
         if self.schedule == "adaptive":
             lower = kl > 2.0 * self.kl_target
             higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)

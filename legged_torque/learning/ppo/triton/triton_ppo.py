@@ -139,11 +139,11 @@ class TritonPPO(TorchPPO):
             settings = {"SAMPLES": SAMPLES, "TILE": NARROW_TILE} | products.BACKWARD
             self._product(products.input_gradient, arguments, memory.rows // SAMPLES, settings)
         self._weight_gradients()
+        if self.is_multi_gpu:
+            distributed.average([self._gradient])
         if self.mirrored:
             gradient = self._gradient[: len(memory.flat)]
             gradient.copy_(self.mirrored.averaged(gradient))
-        if self.is_multi_gpu:
-            distributed.average([self._gradient])
         self._step()
 
     def round_weights(self) -> None:
