@@ -286,9 +286,7 @@ class Teacher:
                 raise UserError(f"the teacher '{name}' has {path}={theirs.get(path)}, its student {own.get(path)}")
         self._env, self.cfg = env, run.env_cfg
         self._size = env.observations.policy_size * run.env_cfg.env.history_length
-        run.train_cfg.algorithm.symmetry_cfg.use_data_augmentation = (
-            False  # mirror images are of the student's observations
-        )
+        run.train_cfg.algorithm.symmetry_cfg.use_data_augmentation = False  # images are of the student's observations
         runner = run.train_cfg.make_runner(self, run.task, None)
         runner.load(str(run.checkpoint), {"actor": True, "iteration": False})
         self.policy = runner.get_inference_policy(env.device)

@@ -6,6 +6,7 @@ from it and its mirror image (compared for legged robots in arXiv 2403.17320).
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 
 import torch
 from rsl_rl.models import MLPModel
@@ -33,14 +34,11 @@ class MirroredWeights:
 
         A UserError if that of a position is a torque of a multi-head actor, whose weights then have none.
         """
-        actions, value = maps["actions"], _kept(1, maps["actions"])
-        self.order, self.signs = _joined(
-            [
-                mirrored
-                for model, outputs in ((actor, actions), (critic, value))
-                for mirrored in _model_maps(model, _joined([maps[group] for group in model.obs_groups]), outputs)
-            ]
-        )
+        actions, parts = maps["actions"], list[Map]()
+        for model, outputs in ((actor, actions), (critic, _kept(1, actions))):
+            inputs = _joined([maps[group] for group in model.obs_groups])
+            parts += _model_maps(model, inputs, outputs)
+        self.order, self.signs = _joined(parts)
 
     def averaged(self, values: Tensor) -> Tensor:
         """Return the mean of numbers, one per parameter, and of their mirror image."""
@@ -48,7 +46,7 @@ class MirroredWeights:
 
     def is_symmetric(self, values: Tensor) -> bool:
         """Return whether numbers are their own mirror image, up to rounding."""
-        return torch.allclose(self.averaged(values), values, atol=1e-3)
+        return torch.allclose(self.averaged(values), values, atol=1e-3, equal_nan=True)
 
     def symmetric(self, values: Tensor) -> Tensor:
         """Return numbers of which one half is kept, and the other half becomes its mirror image."""
@@ -113,6 +111,6 @@ def _reversed(size: int, like: Map) -> Map:
 
 def _joined(maps: Sequence[Map]) -> Map:
     """Return the mirror image of several vectors one behind the other."""
-    starts = [0, *torch.tensor([len(order) for order, _ in maps]).cumsum(0).tolist()]
+    starts = accumulate((len(order) for order, _ in maps), initial=0)
     orders = [order + start for (order, _), start in zip(maps, starts, strict=False)]
     return torch.cat(orders), torch.cat([signs for _, signs in maps])

@@ -9,7 +9,7 @@ FLASHSAC = "legged_torque.learning.flashsac:FlashSAC"
 
 
 class FlashSACCfg(Section):
-    """The section ``flashsac``; of ``algorithm``, it reads class_name, gamma, use_mixed_precision, and images."""
+    """The section ``flashsac``; of ``algorithm``, it reads class_name, gamma, use_mixed_precision, mirror images."""
 
     replay_buffer_size: Count = 10_000_000  # steps that are kept, of all worlds together
     buffer_min_length: Count = 100_000  # steps before the first update, with uniform actions
