@@ -29,9 +29,8 @@ class Mirroring:
 
     def is_its_own_inverse(self) -> bool:
         """Return whether mirroring twice changes nothing."""
-        places = range(len(self.order))
-        twice = [(self.order[place], self.signs[i] * self.signs[place]) for i, place in enumerate(self.order)]
-        return twice == [(i, 1.0) for i in places]
+        pairs = enumerate(self.order)
+        return all(self.order[place] == i and self.signs[i] * self.signs[place] == 1.0 for i, place in pairs)
 
     def unsigned(self) -> "Mirroring":
         """Return the same permutation of values that keep their signs, such as masses."""
