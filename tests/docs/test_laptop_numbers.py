@@ -37,7 +37,7 @@ def test_few_worlds():
     """Mean and latest of the steps after which evaluations track 70%, and how many seeds come there."""
     data, walking = laptop_settings()
     header, rows = rows_of("tried.md", "worlds x steps")
-    assert len(rows) == 5 and data[SETTINGS].drop_duplicates().shape[0] == 65
+    assert len(rows) == 4 and data[SETTINGS].drop_duplicates().shape[0] == 65
     seeds = data.groupby([*SETTINGS, "task"])["seed"].nunique()
     for size, batches, epochs, *cells, _ in rows:
         shape, _, others = size.partition(", ")
@@ -83,7 +83,7 @@ def at_the_end(run):
 
 
 def test_half_of_the_mirror_images():
-    """How many times the steps to 70% they take, and what is lost at the end, of laptop and default preset."""
+    """How many times the steps to 70% they take, and what is lost at the end."""
     data, walking = laptop_settings()
     today = f"{KEPT} fade 4-10M"
     whole, half = (walking.loc[256, 24].xs(name, level="other") for name in (today, f"{today} half images"))
@@ -97,22 +97,11 @@ def test_half_of_the_mirror_images():
     text = text_of("tried.md", "**Mirror images in place")
     few = [ratios[batches, 5] for batches in (2, 3, 4)]
     assert {f"{ratio:.1f}" for ratio in few} == {"1.7"} and "1.7 times the steps to 70% with 2 to 4" in text
-    assert f"{ratios[2, 7]:.2f} times with 7 epochs ({len(runs)} pairs)" in text.replace("\n", " ")
+    assert f"({len(runs)} pairs)" in text
     ends = data[data["other"].str.contains("fade") & data["other"].str.endswith("20M")]
     ends = ends.groupby(["other", "task", "seed"]).apply(at_the_end)
     lost = ends.loc[f"{today} 20M"] - ends.loc[f"{today} half images 20M"]
     assert f"up to {lost.max():.2f} lower ({len(lost)} pairs)" in text and lost.min() > -0.005
-    curves = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('half/')")
-    ends = curves.groupby(["task", "seed"]).apply(at_the_end)
-    evaluations = pd.read_csv(DOCS / "results" / "evaluations.csv.xz").query("environment == 'low'")
-    before = evaluations.groupby(["task", "seed"]).apply(at_the_end)
-    changes = (ends - before).dropna()
-    assert len(ends) == 12 and len(changes) == 9 and -0.015 < changes.mean() < -0.005
-    assert "ended 0.01 lower (9 pairs)" in text
-    curves, before = (rows[rows["track_percentage"] >= 0.7] for rows in (curves, evaluations))
-    first, second = (rows.groupby(["task", "seed"])["steps"].min() for rows in (curves, before))
-    ratio = np.exp(np.log(first / second).dropna().mean())
-    assert f"needed about {ratio:.1f} times the steps" in text
 
 
 def test_equivariant_networks():
@@ -187,32 +176,27 @@ def test_laptop():
     assert said in text_of("howto/learner.md", "- On two cores of a")
     before = data[data["commit"] == "d8439d6"].iloc[-1]
     data = data[~data["task"].str.endswith("flashsac") & (data["commit"] != "d8439d6")]
-    slow, on_xeon = data["commit"] == "9109b7f", data["commit"].isin(["db0ae3b", "a2590d6", "9109b7f"])
-    walks = data[on_xeon & (data["track_percentage"] >= 0.7)].groupby([slow, "task", "seed"])["seconds"].min()
-    walked, slower = walks[False], after(walks[True]["go2_torque_multihead"])
+    on_xeon = data["commit"].isin(["db0ae3b", "a2590d6", "9109b7f"])
+    walked = data[on_xeon & (data["track_percentage"] >= 0.7)].groupby(["commit", "task", "seed"])["seconds"].min()
     text = text_of("getting_started.md", "On two cores of Xeons").replace("\n", " ")
-    for task, words in (
-        ("go2_torque_multihead", "took {} to {} until 70%"),
-        ("a1_position", "{} to {} (`--seed`"),
+    assert "took {} to {} until 70% (".format(*after([walked.min(), walked.max()])) in text and len(walked) == 11
+    on_epyc = data["commit"].isin(["48af7cf", "98be2ed", "0012629"])
+    today = data["commit"] == "0012629"
+    for chosen, words in (
+        (today, "tracked 70 and 80% after {} and {} (A1), {} and {} (PD), the Go2 70% after {} ("),
+        (on_epyc & ~today, "oneDNN multiplied, it had been {} and {}, {} and {}, and {} (48af7cf, 98be2ed)"),
     ):
-        assert f"`{task}` {words.format(*after([walked[task].min(), walked[task].max()]))}" in text
-        assert len(walked[task]) == 4
-    assert f"`a1_torque_multihead` {after(walked['a1_torque_multihead'])[0]} (a2590d6), the Go2" in text
-    assert "on a slower one {} and {} (9109b7f)".format(*slower) in text
-    on_epyc = data["commit"].isin(["48af7cf", "98be2ed"])
-    last = data[on_epyc].groupby("task")[["steps", "seconds"]].max()
-    walks = [
-        data[on_epyc & (data["track_percentage"] >= share)].groupby("task")["seconds"].min() for share in (0.7, 0.8)
-    ]
-    assert (
-        "A1s tracked 70 and 80% after {} and {}, with".format(*after(w["a1_torque_multihead"] for w in walks)) in text
-    )
-    assert "with PD {} and {}, Go2s".format(*after(w["a1_position"] for w in walks)) in text
-    assert f"Go2s 70% after {after(walks[0][['go2_torque_multihead']])[0]} (" in text and len(walks[1]) == 2
-    speeds = sorted([*(last["steps"] / last["seconds"]), before["steps"] / before["seconds"]])
-    speeds = (speeds[1], speeds[-1], speeds[0])
-    said = "seed 1): {:,.0f} to {:,.0f} steps/s, d8439d6 with 128 worlds, small networks {:,.0f}."
-    assert said.format(*(round(speed, -2) for speed in speeds)) in text
+        walks = [
+            data[chosen & (data["track_percentage"] >= share)].groupby("task")["seconds"].min() for share in (0.7, 0.8)
+        ]
+        times = [w[task] for task in ("a1_torque_multihead", "a1_position") for w in walks]
+        assert words.format(*after([*times, walks[0]["go2_torque_multihead"]])) in text and len(walks[1]) == 2
+    last = data[today].groupby("task")[["steps", "seconds"]].max()
+    speeds = sorted(last["steps"] / last["seconds"])
+    slowest = before["steps"] / before["seconds"]
+    assert f"d8439d6 with 128 worlds and small networks makes {round(slowest, -2):,.0f} steps/s." in text
+    said = "{:,.0f} to {:,.0f} steps/s (0012629). When oneDNN"
+    assert said.format(*(round(speed, -2) for speed in (speeds[0], speeds[-1]))) in text
     _, rows = rows_of("getting_started.md", "task")
     for task, *cells in rows:
         of_task = data[(data["task"] == task.strip("`")) & ~on_xeon & ~on_epyc]

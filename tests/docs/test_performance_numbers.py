@@ -45,13 +45,9 @@ def test_start():
 
 
 def test_whole_trainings():
-    """Seconds of a training without evaluations, on one and two GPUs, and until it tracks 70%; FlashSAC's."""
+    """Steps per second on two GPUs, and seconds until a training tracks 70%; FlashSAC's."""
     whole = next(each for each in DATA if "no_exchange" in each)
     (one,) = whole["one"]
-    after = sum(one[stage] for stage in ("evaluations", "logs and checkpoints", "rollouts", "updates", "end"))
-    assert f"88 million steps of `a1_torque_multihead` took {after:.0f} s" in text_of(
-        "performance.md", "- **Training.**"
-    )
     speeds = {name: pd.DataFrame(whole[name])["steps_per_s"].mean() for name in ("two", "no_exchange")}
     times = {name: speed / one["steps_per_s"] for name, speed in speeds.items()}
     text = text_of("performance.md", "- **Two")
@@ -79,8 +75,6 @@ def test_mjlab():
     times = f"{mine[0] / theirs[1]:.0f} times as many steps/s on MuJoCo Warp, and {mine[1] / theirs[1]:.0f} times with"
     text = text_of("performance.md", "## Compared with mjlab")
     assert times in text and f"own, {mine[2] / 133e3:.0f} to {mine[2] / theirs[0]:.0f} times" in text
-    whole = [row["steps_per_s_of_the_display"] / 1e6 for row in DATA[-1]["rows"][1:]]
-    assert "ours made {:.1f} and {:.1f} million steps/s".format(*whole) in text
     seconds = [row["seconds_to_70"] - row["start_up_s"] for row in DATA[-1]["rows"] if "seconds_to_70" in row]
     said = (
         "{:.0f} s after the first iteration on MuJoCo Warp (288b895), {:.1f} s with the fused engine (2677d36), {:.1f}"
@@ -113,25 +107,19 @@ def test_counters():
 
 
 def test_self_collision():
-    """Times of physics steps without contacts between parts, and with them before and after changes."""
+    """Times of physics steps without and with contacts between parts."""
     rows = pd.DataFrame(measured("contacts between parts")["rows"])
-    columns = [(False, "2cdd058"), (True, "880b83a"), (True, "2cdd058")]
-    times = rows.set_index(["worlds", "robots", "self_collision", "commit"])["us"]
+    times = rows.set_index(["worlds", "robots", "self_collision"])["us"]
     _, said = rows_of("performance.md", "worlds | robots | without")
     assert len(said) == 6
     for worlds, robots, *cells in said:
-        found = [times.get((int(worlds), robots, *column)) for column in columns]
-        assert ["" if us is None else f"{us:.0f}" for us in found] == cells, (worlds, robots)
+        found = [times[int(worlds), robots, has_contacts] for has_contacts in (False, True)]
+        assert [f"{us:.0f}" for us in found] == cells, (worlds, robots)
 
 
 def test_the_update():
-    """The shares of the peaks that it reaches, and what cuBLAS takes."""
+    """The shares of the peaks that it reached."""
     shares = measured("shares of the peaks")["update_share_of_peaks"]
-    data = measured("products of a minibatch")
-    stages = {each["stage"]: each["us"] for each in data["stages"]}
-    hidden = sum(stages[f"forward {i}"] for i in range(3))
-    cublas = 2 * sum(each["us"] for each in data["cublas"][:3])
     text = text_of("performance.md", "An update is 20").replace("\n", " ")
-    assert f"layers took {hidden:.0f} us forward, in cuBLAS {cublas:.0f}," in text
     products, memory = (100 * share for share in shares.values())
     assert f"ran at {products:.0f}% of the peak of products and {memory:.0f}% of that of memory" in text

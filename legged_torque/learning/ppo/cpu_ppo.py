@@ -17,10 +17,10 @@ _CPU_INFO = Path("/proc/cpuinfo")  # of Linux
 _IS_INTEL = _CPU_INFO.exists() and "GenuineIntel" in _CPU_INFO.read_text(encoding="utf-8")
 _HAS_AVX512 = torch.backends.cpu.get_cpu_capability().startswith("AVX512")
 USE_ONEDNN = torch.backends.mkldnn.is_available() and _HAS_AVX512 and not _IS_INTEL  # mkldnn is its old name
-"""Whether oneDNN multiplies matrices in place of MKL, which uses AVX-512 on Intel's CPUs only.
+"""Whether oneDNN multiplies matrices, not MKL.
 
-On an AMD EPYC with AVX-512, oneDNN takes half the time of MKL; on one without and on a Xeon, it takes 1.1 to 1.5 times
-as much.
+On one AMD EPYC it took half the time of MKL; on one without AVX-512 and on a Xeon, it takes 1.1 to 1.5 times as much.
+That AVX-512 makes the difference between AMD's CPUs is a guess: the first one is not known any more.
 """
 
 
