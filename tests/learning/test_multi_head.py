@@ -70,6 +70,18 @@ def test_layers_of_the_paper(make_runner, name):
     assert [columns for _, columns in critic[1:]] == [512, 256, 128]
 
 
+@pytest.mark.parametrize(("name", "end"), [("a1_torque_multihead", 0.0), ("a1_multihead", 0.1)])
+def test_weights_in_the_entropy(make_runner, name, end):
+    """Those of eq. 7: positions count less and less while their part fades within 50 million steps, torques wholly."""
+    runner = make_runner(name=name)
+    for steps, weight in ((0, 1.0), (32_000_000, 1.0 - 0.64 * (1.0 - end)), (50_048_000, end)):
+        runner.env.total_steps.fill_(steps)
+        runner.env.update_curriculum()
+        runner.alg.set_progress(0, 1)
+        expected = torch.tensor([weight] * NUM_DOF + [1.0] * NUM_DOF)
+        torch.testing.assert_close(runner.alg.actor.distribution.weights, expected)
+
+
 @pytest.mark.parametrize("name", ["a1_position", "a1_torque", "a1_torque_curriculum"])
 def test_the_other_approaches_have_one_head(make_runner, name):
     """Their actor is 512-256-128-12, the same for all of them."""

@@ -7,6 +7,7 @@ import pytest
 import torch
 from rsl_rl.algorithms import PPO
 from support.rollouts import (
+    NUM_ACTIONS,
     POISONS,
     SAMPLES,
     SETTINGS,
@@ -26,7 +27,7 @@ from support.settings import error_of
 from torch import nn
 
 from legged_torque.learning.distribution import GaussianDistribution
-from legged_torque.learning.ppo import LOSS_NAMES, cpu_ppo
+from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, cpu_ppo
 from legged_torque.learning.ppo.cpu_ppo import run_network
 
 
@@ -148,6 +149,27 @@ def test_annealing(progress, left):
     assert float(fixed.learning_rate) == pytest.approx(left * 1e-3)
     assert float(fixed.optimizer.param_groups[0]["lr"]) == float(fixed.learning_rate)
     assert float(adaptive.learning_rate) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("kind", [OnDevicePPO, cpu_ppo.CpuPPO])
+def test_entropy_counts_actions_by_weights(kind):
+    """That of a Gaussian is log(std) + (1 + log(2 pi)) / 2 for each action; without weight, the bonus moves no std."""
+    alg = make_ppo(kind, entropy_coef=0.1)
+    record_rollout(alg)
+    weights = torch.linspace(0.0, 1.0, NUM_ACTIONS)
+    alg.action_weights.copy_(weights)
+    deviations = torch.linspace(0.5, 2.0, NUM_ACTIONS)
+    alg.actor.distribution.log_std_param.data.copy_(deviations.log())
+    results = []
+    for bonus in (0.1, 0.3):
+        alg.entropy_weight.fill_(bonus)
+        loss, (_, _, entropy, _) = alg.loss()
+        results.append((float(loss), torch.autograd.grad(loss, alg.actor.distribution.log_std_param)[0]))
+    (small, gradient), (large, larger_gradient) = results
+    by_hand = float((weights * (deviations.log() + 0.5 * (1.0 + math.log(2.0 * math.pi)))).sum())
+    assert float(entropy) == pytest.approx(by_hand, rel=1e-5)
+    assert small - large == pytest.approx(0.2 * by_hand, rel=1e-4)
+    torch.testing.assert_close(gradient - larger_gradient, 0.2 * weights, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("share", "factor"), [(1.0, 1.0), (1 / 3, 1 / 1.5)])

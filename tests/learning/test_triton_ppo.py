@@ -58,6 +58,8 @@ def test_gradients_are_those_of_autograd(kind):
     """Of all parameters, for a policy that has moved since it acted, so that ratios and values are clipped too."""
     settings = {"max_grad_norm": 1e9, "clip_param": 0.02, "learning_rate": 1e-2, "entropy_coef": 0.1, **kind}
     algorithms = plain, fused = pair(**settings)
+    for alg in algorithms:
+        alg.action_weights.copy_(torch.linspace(0.0, 1.0, len(alg.action_weights)))
     for round_number in range(2):
         choose(algorithms, round_number)
         plain.losses.zero_()

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
@@ -45,7 +46,7 @@ def make_ppo(kind=OnDevicePPO, steps=STEPS, worlds=WORLDS, seed=0, obs_normaliza
     """An algorithm with small networks, and room for a rollout of ``steps`` x ``worlds``."""
     torch.manual_seed(seed)
     distribution = {"class_name": "GaussianDistribution", "init_std": 1.0, "std_type": "log"}
-    if kind is OnDevicePPO:
+    if kind is not PPO:
         distribution["class_name"] = GaussianDistribution
     obs, groups = random_obs(worlds), {"actor": ["policy"], "critic": ["critic"]}
     actor = MLPModel(obs, groups, "actor", NUM_ACTIONS, [16, 16], "elu", obs_normalization, distribution)

@@ -43,6 +43,3 @@ class SataCfgPPO(FastCfgPPO):
 
     class runner:
         total_steps = 750_000_000
-
-    class algorithm:
-        max_learning_rate = 2e-3  # as of torque control

@@ -9,6 +9,3 @@ class TorqueCfg(LeggedRobotCfg):
 
 class TorqueCfgPPO(LeggedRobotCfgPPO):
     """Training of torque control."""
-
-    class algorithm:
-        max_learning_rate = 2e-3  # with near-zero rewards the adaptive rate climbs until the critic diverges

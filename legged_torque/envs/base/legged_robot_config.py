@@ -372,7 +372,7 @@ class LeggedRobotCfgPPO(TrainingCfg):
         max_grad_norm: Positive = 1.0  # gradients of actor and critic are clipped to this norm
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # adaptive: steered by the KL divergence
         desired_kl: Positive = 0.02  # of the policy before and after an update
-        max_learning_rate: Fraction = 1e-2  # upper bound of an adaptive learning rate
+        max_learning_rate: Fraction = 2e-3  # upper bound of an adaptive learning rate
         annealing_start: Share = 0.5  # of the training; then the rate (or desired_kl) and the entropy bonus fall to 0
         use_clipped_value_loss: bool = True  # whether value changes are clipped too
         use_mixed_precision: bool = True  # on a GPU with Triton, matrix products of bfloat16 numbers instead of TF32

@@ -42,6 +42,7 @@ class TorchPPO(PPO):
         order: The samples of a rollout, in the order of an epoch. Shape: (batch_size * num_mini_batches,), int64.
         indices: Those of the minibatch that is learned from. Shape: (batch_size,), int64.
         update_graph: An epoch, which takes a gradient step on each minibatch of ``order``.
+        action_weights: Weights of the actions in the entropy. Shape: (num_actions,).
         product_dtype: Numbers that matrix products take; those of float32 may be TF32.
         mirrored: The mirror image of all parameters, of equivariant networks; else None.
     """
@@ -86,6 +87,9 @@ class TorchPPO(PPO):
         self.annealing_start, self._first_rate = annealing_start, learning_rate
         self.kl_target = torch.tensor(self.desired_kl or 0.0, device=self.device)  # of the adaptive learning rate
         self.entropy_weight = torch.tensor(self.entropy_coef, device=self.device)
+        self.action_weights = torch.ones(storage.actions.shape[-1], device=self.device)
+        self.actor.distribution.weights = self.action_weights
+        self._control_law: Any = None
         self._parts = [list(model.parameters()) for model in (self.actor, self.critic)]  # each is clipped by itself
         self._parameters = [*self._parts[0], *self._parts[1]]
         if self.mirrored:
@@ -113,6 +117,7 @@ class TorchPPO(PPO):
         alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
         alg.update_graph.enabled = cfg["capture"]
         alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
+        alg._control_law = getattr(env, "control_law", None)
         return alg
 
     @classmethod
@@ -146,11 +151,14 @@ class TorchPPO(PPO):
         """Prepare the update of an iteration: the critic learns alone at first, and the last updates are small.
 
         After the share ``annealing_start`` of the training, the weight of the entropy and the desired KL divergence
-        fall linearly to 0. The adaptive learning rate follows the latter; a fixed learning rate falls itself.
+        fall linearly to 0. The adaptive learning rate follows the latter; a fixed learning rate falls itself. Actions
+        count in the entropy by the weights of their torques: without effect, they would become ever more random.
         """
         self.actor_learns.fill_(float(iteration >= self.warm_up_iterations))
         left = annealed(iteration, num_iterations, self.annealing_start)
         self.entropy_weight.fill_(left * self.entropy_coef)
+        if self._control_law:
+            self.action_weights.copy_(self._control_law.weights().clamp(0.0, 1.0))
         if self.schedule == "adaptive":
             self.kl_target.fill_(left * self.desired_kl)
         else:

@@ -102,8 +102,8 @@ def squared_error(value, first, target, clip, CLIP_VALUES: tl.constexpr):
 def losses(
     outputs, std_parameter, low, high, old_std, indices, order, signs, actions, means, log_probs, values, advantages,
     returns, actor_learns, gradients, places, strides, sums, sums_stride, num_chosen, num_samples, size,
-    clip, value_weight, entropy_weight, IS_LOG: tl.constexpr, CLIP_VALUES: tl.constexpr, ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
+    clip, value_weight, entropy_weight, action_weights, IS_LOG: tl.constexpr, CLIP_VALUES: tl.constexpr,
+    ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients of the losses by the outputs of the networks, and each program's sums of the losses.
 
@@ -137,9 +137,10 @@ def losses(
     by_mean = tl.where(used, by_log_prob[:, None] * distance / std[None, :], 0.0)
     share = tl.sum(is_sample.to(tl.float32)) / num_samples  # of this program
     by_std = tl.sum(tl.where(used, by_log_prob[:, None] * (distance * distance - 1.0), 0.0), 0)
-    by_std = (by_std - tl.load(entropy_weight) * share * tl.load(actor_learns)) / std * slope
+    weight = tl.load(action_weights + columns, mask=is_action, other=0.0)
+    by_std = (by_std - tl.load(entropy_weight) * weight * share * tl.load(actor_learns)) / std * slope
     half_log_two_pi_e = 1.4189385332046727
-    entropy = share * tl.sum(tl.where(is_action, half_log_two_pi_e + tl.log(std), 0.0))
+    entropy = share * tl.sum(weight * (half_log_two_pi_e + tl.log(std)))
 
     old_mean = tl.load(means + chosen[:, None] * size + columns[None, :], mask=used, other=0.0)
     old = tl.load(old_std + columns, mask=is_action, other=1.0)

@@ -220,7 +220,7 @@ class TritonPPO(TorchPPO):
         policy = (storage.actions, self._means, storage.actions_log_prob)
         values = (storage.values, storage.advantages, storage.returns)
         counts = (self.batch_size, self._num_samples, size)
-        weights = (self.clip_param, self.value_loss_coef, self.entropy_weight)
+        weights = (self.clip_param, self.value_loss_coef, self.entropy_weight, self.action_weights)
         sums = memory.loss_sums
         samples.losses[(len(sums),)](
             memory.outputs, *self._std[:3], self._stds, self.indices, *self._action_map, *policy, *values,
