@@ -12,11 +12,6 @@ from legged_torque.paper.report.tables import holm, welch
 from legged_torque.paper.values import TABLE_I
 from legged_torque.utils.config import to_dict
 
-ROUGH = {name: task.replace("a1_", "a1_rough_") for name, task in TASKS.items()}
-KINDS = {name: [name.replace(" ", "_")] for name in ("stairs up", "stairs down", "stepping stones", "gaps", "pits")}
-KINDS |= {"obstacles": ["discrete_obstacles"]}
-KINDS |= {"slopes, waves, flat": ["flat", "smooth_slope_up", "smooth_slope_down", "rough_slope", "waves"]}
-
 
 @pytest.fixture(scope="module")
 def table_one():
@@ -160,93 +155,6 @@ def test_latency():
     assert f"{low[0]:.3f} to {low[1]:.3f} with actions 20 ms late" in text
     often = f"falls {falls.min():.0f} to {falls.max():.0f} times a minute"
     assert f"{often}; PD tracks {high[0]:.3f} to {high[1]:.3f}" in text
-
-
-@pytest.mark.parametrize("column", KINDS)
-def test_rough_ground(column):
-    """Shares of robots that cross tiles, tracking and cost of transport, over all difficulties."""
-    data = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.xz")
-    columns, rows = rows_of("results.md", "policy | slopes, waves, flat")
-    for policy, *numbers in rows:
-        method, sight, seeds = re.fullmatch(r"(.+), (blind|scan)(?:, (\d) seeds)?", policy).groups()
-        task = ROUGH[method] + ("_scan" if sight == "scan" else "")
-        chosen = data[(data["task"] == task) & (data["environment"] == "low")]
-        assert chosen["seed"].nunique() == int(seeds or 1)
-        crossed = chosen[chosen["kind"].isin(KINDS[column])]["crossed"].mean()
-        cost = chosen[chosen["kind"] == "rough_slope"]["cost_of_transport"].mean()
-        values = {column: crossed, columns[-2]: chosen["track_percentage"].mean(), columns[-1]: cost}
-        assert all(same(numbers[columns.index(name) - 1], value) for name, value in values.items()), (policy, values)
-
-
-def test_stairs():
-    """How many of the stairs up policies climb, by seed."""
-    data = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.xz").query("environment == 'low'")
-    climbed = data[data["kind"] == "stairs_up"].groupby(["commit", "task", "seed"])["crossed"].mean()
-    text, of_task = text_of("results.md", "- In crossing"), climbed.groupby("task")
-    low, *others = sorted(of_task.get_group("a1_rough_position"))
-    said = f"blind PD climbs {others[0]:.2f} to {others[-1]:.2f} of them in four seeds and {low:.2f} in one, the torque"
-    assert said in text and len(others) == 4
-    assert round(3 * of_task.min()["a1_rough_torque_curriculum_scan"], 1) == 2 and "with the scan two thirds." in text
-    own = climbed[climbed.index.get_level_values("task").str.match("a1_rough_torque_multihead")]
-    assert own.min() >= 0.93 and "Torque multi-head climbed at least 0.93." in text.replace("\n ", "")
-
-
-def test_which_seeds_learn_on_rough_ground():
-    """Tracking and stairs of the seeds that learned and of those that did not, and when one can tell."""
-    text = text_of("results.md", "- **Not every seed").replace("\n ", "")
-    evaluations = pd.read_csv(DOCS / "results" / "rough" / "evaluations.csv.gz")
-    tiles = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.xz").query("kind == 'stairs_up'")
-    ends, stairs = (
-        rows.groupby(["environment", "task", "seed"])[column].mean()
-        for rows, column in ((evaluations.query("steps > 246e6"), "track_percentage"), (tiles, "crossed"))
-    )
-    own = "low, equivariant networks", "a1_rough_torque_multihead"
-    stands, *learned = sorted(ends[own])
-    assert f"tracks {learned[0]:.3f} to {learned[-1]:.3f} after step 246 million in four" in text and len(learned) == 4
-    assert sorted(stairs[own])[1] > 0.965 and f"one stands still ({stands:.3f})" in text
-    images = "low, mirror images", "a1_rough_torque_multihead"
-    late, less, *others = sorted(ends[images])
-    said = f"it tracks {others[0]:.3f} to {others[-1]:.3f} in three seeds, but {late:.3f} and {less:.3f}, which climb"
-    assert "{} {:.2f} and {:.2f}.".format(said, *sorted(stairs[images])[:2]) in text
-    low, _, high = sorted(ends["low, equivariant networks", "a1_rough_position"])
-    assert f"PD of three seeds tracks {low:.3f} to {high:.3f}." in text
-    early = evaluations.query("12e6 < steps < 18.1e6 and environment.str.startswith('low, ')")
-    early = early[~early["environment"].str.contains("late")].groupby(["environment", "task", "seed"])
-    fails = early["track_percentage"].mean().lt(0.2)
-    assert set(fails[fails].index) == {(*own, ends[own].idxmin()), *((*images, seed) for seed in (1, 3))}
-    assert early["track_percentage"].mean()[~fails].min() > 0.4
-
-
-def test_easiest_tiles_first():
-    """How many seeds failed with either start, and what whole trainings tracked."""
-    text = text_of("tried.md", "With `terrain.max_init").replace("\n", " ")
-    runs = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('rough/') and task.str.startswith('a1')")
-    early = runs[runs["steps"].between(1.2e7, 1.9e7)].groupby(["changes", "run"])["track_percentage"].last()
-    easy = early[early.index.get_level_values("changes").str.contains("max_init")]
-    assert (len(easy), len(early) - len(easy)) == (11, 7) and easy.lt(0.2).sum() == 1 and early.lt(0.2).sum() == 2
-    assert "one of eleven seeds" in text and "with the default two of twelve;" in text  # with the five of the results
-    ends = runs[runs["steps"] > 246e6].groupby("run")["track_percentage"].mean()
-    assert "two tracked {:.3f} and {:.3f}".format(*sorted(ends)) in text
-
-
-def test_rough_ground_with_latency():
-    """Tracking at the end of training, by seed, and shares of tiles."""
-    data = pd.read_csv(DOCS / "results" / "rough" / "evaluations.csv.gz").query("steps > 246e6")
-    late = data[data["environment"].str.contains("late")].groupby(["task", "seed"])
-    tracking = late["track_percentage"].mean()
-    own, position = tracking["a1_rough_torque_damped"], tracking["a1_rough_position"]
-    text, three = text_of("results.md", "- **With latency**"), "{:.3f}, {:.3f} and {:.3f}"
-    said = f"{three.format(*own)} after step 246 million, more than tuned PD with {three.format(*position)} (p = "
-    assert f"{said}{welch(own, position):.3f};" in text and own.min() > position.max()
-    falls = late["falls_per_minute"].mean().groupby("task").agg(["min", "max"])
-    (low, high), (low_pd, high_pd) = falls.loc["a1_rough_torque_damped"], falls.loc["a1_rough_position"]
-    assert f"It falls {low:.2f} to {high:.2f} times a minute, PD {low_pd:.2f} to {high_pd:.2f}." in text
-    grounds = pd.read_csv(DOCS / "results" / "rough" / "grounds.csv.xz").query("environment.str.contains('late')")
-    for tiles, words in (
-        (grounds, "Both cross {:.2f} of the"),
-        (grounds.query("kind == 'stairs_up'"), "stairs up {:.2f}."),
-    ):
-        assert all(words.format(crossed) in text for crossed in tiles.groupby("task")["crossed"].mean())
 
 
 def test_tuned_gains(table_one):
