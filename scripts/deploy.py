@@ -160,8 +160,7 @@ def connect(args: argparse.Namespace, policy: Any) -> Any:
     if args.robot not in (None, trained):
         raise UserError(f"--robot must be '{trained}', of which the policy is, not '{args.robot}'")
     if args.interface == "sim":
-        from legged_torque.runtime.in_process import InProcess
-        from legged_torque.runtime.sim_robot import SimRobot
+        from legged_torque.runtime.sim_robot import InProcess, SimRobot
 
         xml = resource_path(policy.description["robot"]["file"])
         return InProcess(SimRobot(xml, policy.joint_order, args.rate, hangs=bool(args.chirp)))

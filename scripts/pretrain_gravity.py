@@ -23,9 +23,8 @@ from legged_torque.utils.options import Options
 def main() -> None:
     """Parse the command line, and make the policy or check it."""
     parser = cli.Parser(__doc__)
-    cli.add_options(parser, *cli.SETTINGS, "num_envs")
+    cli.add_options(parser, *cli.SETTINGS, "num_envs", "log_root")
     parser.set_defaults(task="a1_torque_gravity")
-    parser.add_argument("--log_root", help="folder that keeps all experiments; default: logs/ in the current directory")
     parser.add_argument("--num_configurations", type=int, help="random initial states; default: as in the task")
     parser.add_argument("--num_steps", type=int, help="control steps to follow each state; default: as in the task")
     parser.add_argument("--json", type=Path, help="write the report with its histograms to this file as well")

@@ -9,7 +9,6 @@ Examples:
 
 import argparse
 import contextlib
-import importlib.metadata
 from pathlib import Path
 
 from legged_torque import resource_path
@@ -21,7 +20,7 @@ from legged_torque.utils.errors import UserError, counted, printable
 from legged_torque.utils.files import write_json
 from legged_torque.utils.limits import Count, NotNegative, Number, Share
 from legged_torque.utils.options import choose_motors
-from legged_torque.utils.runs import CONFIG_FILE
+from legged_torque.utils.runs import CONFIG_FILE, by_age, package_versions
 from legged_torque.utils.task_registry import LOGS
 
 
@@ -114,7 +113,7 @@ def main() -> None:
     if args.json:
         result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
         result |= {"task": policy.description["task"], "training": training, "notes": notes}
-        result["versions"] = {name: importlib.metadata.version(name) for name in ("mujoco", "numpy")}
+        result["versions"] = package_versions()
         result["metrics"] = {name: vars(estimate) for name, estimate in metrics.items()}
         write_json(args.json, result)  # in which null stands for values that were not measured
     if recorder:
@@ -127,7 +126,7 @@ def last_export(log_root: Path) -> Path:
     if not exports:
         raise UserError(f"there is no exported policy in '{log_root}'; run export.py first, or name a policy")
     of_run = {file: (file.parents[1] / CONFIG_FILE).is_file() for file in exports}  # not of a policy from elsewhere
-    return max(exports, key=lambda file: (of_run[file], file.parents[1].name, file.stat().st_mtime)).parent
+    return max(exports, key=lambda file: (of_run[file], by_age(file.parents[1])[:2], file.stat().st_mtime)).parent
 
 
 if __name__ == "__main__":

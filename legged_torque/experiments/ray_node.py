@@ -22,6 +22,7 @@ from legged_torque.utils.files import write_whole
 from legged_torque.utils.runs import package_versions
 
 Files = dict[str, bytes]  # contents by path below the folder of the results
+Version = tuple[int, int, int]  # of a file: when it was written [ns], its size, and its number in the file system
 REPORT_EVERY = 1.0  # seconds between reports of a running step
 LOG = "output.log"
 _NOT_SENT = re.compile(rf"\.\d+\.part(/|$)|^{LOG}$")
@@ -48,9 +49,10 @@ class NodeStep:
         gpus = ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
         place = f"{address} cuda:{gpus[0]}" if gpus else f"{address} {device}"
         check_versions(f"{address} ({socket.gethostname()})", versions, versions_here())
-        self._folder, self._sent = tempfile.TemporaryDirectory(prefix="legged_torque_"), time.time()
-        root = Path(self._folder.name)
+        self._folder, self._reported_at = tempfile.TemporaryDirectory(prefix="legged_torque_"), time.monotonic()
+        root, self._sent = Path(self._folder.name), dict[str, Version]()
         write_files(root, files)
+        new_files(root, self._sent)  # which the sender has
         with open(root / LOG, "wb") as output:
             self._process = LocalProcess(place, command_of(words), output, {}, cwd=root)
         self._reported = 0  # bytes of its log
@@ -60,11 +62,11 @@ class NodeStep:
         """Return news after a while; new files are sent at the end, and before every ``send_every`` seconds."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(REPORT_EVERY)
-        now, root, report = time.time(), Path(self._folder.name), Report(self._process.place, self._process.poll())
+        now, root, report = time.monotonic(), Path(self._folder.name), Report(self._process.place, self._process.poll())
         log = (root / LOG).read_bytes()
         report.log, self._reported = log[self._reported :], len(log)
-        if report.status is not None or now - self._sent >= send_every:
-            report.files, self._sent = new_files(root, self._sent), now
+        if report.status is not None or now - self._reported_at >= send_every:
+            report.files, self._reported_at = new_files(root, self._sent), now
         if report.status is not None:
             self._folder.cleanup()
         return report
@@ -79,14 +81,20 @@ def is_checkpoint(name: str) -> bool:
     return PurePosixPath(name).match("model_*.pt")
 
 
-def new_files(root: Path, since: float) -> Files:
-    """Return the files below a folder that have changed since a time, apart from the log and what is being written."""
+def new_files(root: Path, sent: dict[str, Version]) -> Files:
+    """Return the files below a folder that differ from those in ``sent``, which is updated.
+
+    The log and what is being written are left out. Times alone do not tell: a file that is renamed when it is whole
+    has the time of its last write.
+    """
     files = {}
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
         with contextlib.suppress(FileNotFoundError):  # it is being replaced
-            if path.is_file() and path.stat().st_mtime >= since and not _NOT_SENT.search(name):
-                files[name] = path.read_bytes()
+            about = path.stat()
+            version = about.st_mtime_ns, about.st_size, about.st_ino
+            if path.is_file() and sent.get(name) != version and not _NOT_SENT.search(name):
+                files[name], sent[name] = path.read_bytes(), version
     return files
 
 

@@ -75,7 +75,8 @@ class ExperimentRun:
                     self._show()
                     time.sleep(POLL)
         finally:
-            self._ask_to_stop()  # after an exception too no process is left running
+            if not passed_on:  # a second request would keep them from saving
+                self._ask_to_stop()  # after an exception too no process is left running
             for job in self._running.values():
                 with contextlib.suppress(UserError):  # an error of one must not keep others from saving
                     while job.process.poll() is None:
@@ -173,8 +174,9 @@ class ExperimentRun:
         return f"{self._num_done} of {self._num_cells} cells done, {times(self._display.tasks[0])}"
 
     def _print(self, text: str) -> None:
-        """Print a line with the time."""
-        print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
+        """Print a line with the time; where nobody reads any more, the work goes on."""
+        with contextlib.suppress(BrokenPipeError):
+            print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
 
     def _show(self) -> None:
         """Show a bar for all cells and one for each running step."""

@@ -185,7 +185,7 @@ def _keep_robot(spec: mujoco.MjSpec, file: Path, is_urdf: bool, notes: Notes) ->
         raise UserError(f"cannot import '{file}': one child of the world must have joints, not {len(roots)}")
     others = [body for body in children if body is not roots[0]]
     notes.on((f"'{body.name}'" for body in others), "no parts of the robot, left out")
-    if any(children[body] for body in others):
+    if not roots[0].joints or any(children[body] for body in others):
         for key in list(spec.keys):
             spec.delete(key)
     for body in others:
@@ -193,8 +193,6 @@ def _keep_robot(spec: mujoco.MjSpec, file: Path, is_urdf: bool, notes: Notes) ->
     if not roots[0].joints:
         roots[0].add_freejoint()
         notes += [] if is_urdf else [f"'{roots[0].name}' was fixed to the world; it floats now"]
-        for key in list(spec.keys):
-            spec.delete(key)
         (link, *others) = roots[0].bodies
         if not (others or roots[0].explicitinertial or list(roots[0].geoms) or link.joints):
             link.pos = [0.0, 0.0, 0.0]

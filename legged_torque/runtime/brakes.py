@@ -66,7 +66,7 @@ def fault(state: RobotState, age: float, received: Received, joints: Joints, bra
         (beyond, "rad, beyond its range", state.joint_positions),
         (speeds, "rad/s, too fast", state.joint_velocities),
         (hot, "deg C, too hot", state.temperatures),
-        (state.errors, "as error flag", state.errors),
+        (np.abs(state.errors), "as error flag", state.errors),
     ):
         worst = int(np.argmax(excess))
         if excess[worst] > 0:

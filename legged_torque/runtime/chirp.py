@@ -39,7 +39,7 @@ class Chirp(Policy):
             raise UserError("--chirp needs a policy with a stiffness above 0 of all joints: its sweeps are positions")
         term = {"name": "position_residual", "scale": 1.0, "mixing_weight": 1.0}
         self._action_terms, self.supplied, self.scan = [term], [], None
-        timing = policy.description["timing"] | {"control_frequency": rate}
+        timing = policy.description["timing"] | {"control_frequency": rate, "refresh_torques": True}
         network = policy.description["network"] | {"sha256": CHECKSUM}
         self.description = policy.description | {"actions": {"terms": [term]}, "timing": timing, "network": network}
         self._period, self._seconds = 1.0 / rate, seconds

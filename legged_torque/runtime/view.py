@@ -84,7 +84,7 @@ class View:
             is_hot = state.temperatures[i] > NEAR * controller.brakes.max_temperature
             cells = [Text(f"{bar:{BAR}} {share[i]:4.0%}", "red" if share[i] > NEAR else "green")]
             cells.append(Text(f"{state.temperatures[i]:.0f}", "red" if is_hot else ""))
-            error = f"{state.errors[i]:#x}" if state.errors[i] else ""
+            error = f"{int(state.errors[i]):#x}" if state.errors[i] else ""
             table.add_row(name, *(f"{number:+8.3f}" for number in numbers), *cells, error)
         return Group(head, table)
 

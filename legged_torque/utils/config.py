@@ -78,7 +78,7 @@ class Section:
                     value.check(dotted)
                 else:
                     advice = advice if key in self._names else DECLARE
-                    check_value(_dotted(path, key, self._names), value, _type_of(self, key))
+                    check_value(checked_path(path, key, self._names), value, _type_of(self, key))
         refuse(problems, advice=advice)
 
 
@@ -192,7 +192,7 @@ def set_by_path(section: Any, dotted_path: str, value: Any) -> None:
 
 def _set(section: Any, keys: list[str], value: Any, path: str) -> None:
     """Set the entry below ``section``, which is at ``path``, that ``keys`` lead to."""
-    (key, *rest), dotted = keys, _dotted(path, keys[0], section_keys(section))
+    (key, *rest), dotted = keys, checked_path(path, keys[0], section_keys(section))
     old, hint = getattr(section, key), _type_of(section, key)
     if isinstance(old, Section):
         _set(old, rest, value, dotted) if rest else update_from_dict(old, value, dotted)
@@ -200,7 +200,7 @@ def _set(section: Any, keys: list[str], value: Any, path: str) -> None:
     if rest and (rest[1:] or not isinstance(old, dict)):
         raise UserError(f"config key '{dotted}' is a value, it has no entry '{'.'.join(rest)}'")
     for entry in rest:  # at most one, of a dictionary
-        _dotted(dotted, entry, list(old))
+        checked_path(dotted, entry, list(old))
     if isinstance(value, str):
         with contextlib.suppress(UserError):  # of a text that is no value itself
             setattr(section, key, check_value(dotted, {**old, rest[0]: value} if rest else value, hint))
@@ -209,7 +209,7 @@ def _set(section: Any, keys: list[str], value: Any, path: str) -> None:
     setattr(section, key, check_value(dotted, {**old, rest[0]: value} if rest else value, hint))
 
 
-def _dotted(path: str, key: str, names: list[str]) -> str:
+def checked_path(path: str, key: str, names: list[str]) -> str:
     """Return the dotted path of the entry ``key`` at ``path``; a UserError if it is not one of the names."""
     prefix = f"{path}." if path else ""
     if key not in names:

@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, ClassVar, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import BarColumn, Progress, Task, TextColumn
 from rich.segment import SegmentLines
-from rich.table import Column
 from rich.text import Text
 
 from legged_torque.utils.interrupt import write_error
@@ -69,9 +68,9 @@ class Display:
             clock: Returns the time [s].
         """
         self.total, self.done, self._what = total, done, what
-        columns = (TextColumn("{task.description}", markup=False), BarColumn(None), _Times(Column(no_wrap=True)))
+        columns = (TextColumn("{task.description}", markup=False), BarColumn(None), TextColumn("{task.fields[times]}"))
         self.bar = Progress(*columns, expand=True, get_time=clock, speed_estimate_period=SPEED_OVER)
-        self._id = self.bar.add_task("", start=False, total=total, completed=done)
+        self._id = self.bar.add_task("", start=False, total=total, completed=done, times="")
         self._stream, self._stays, self._clock = stream or sys.stdout, stays, clock
         self.activity = self.notice = ""
         self.warnings: tuple[str, ...] = ()
@@ -82,9 +81,10 @@ class Display:
 
     def update_bar(self) -> Task:
         """Update the bar, and return its task: how fast the work is, and how long the rest will take."""
-        text = f"{self._what} {self.done} of {self.total}"
+        text, task = f"{self._what} {self.done} of {self.total}", self.bar.tasks[0]
         self.bar.update(self._id, completed=self.done, description=text)
-        return self.bar.tasks[0]
+        task.fields["times"] = f"{math.floor(task.percentage):3}% {times(task)}"  # 100% only when all is done
+        return task
 
     def view(self) -> RenderableType:
         """Return the view for a terminal."""
@@ -151,14 +151,6 @@ class Display:
             return SegmentLines(self._console.render_lines(self.view(), options, pad=False), new_lines=True)
         except Exception as error:  # of any number or name that is shown
             return Text(f"nothing to see: {type(error).__name__}: {error}")
-
-
-class _Times(ProgressColumn):
-    """The column with the share that is done, and :func:`times`."""
-
-    def render(self, task: Task) -> Text:
-        """Return the text of a task; 100% only when all is done."""
-        return Text(f"{math.floor(task.percentage):3}% {times(task)}")
 
 
 class Counter(Display):

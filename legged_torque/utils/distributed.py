@@ -138,9 +138,9 @@ def _meet(device: str) -> None:
     global _shared
     try:
         torch.distributed.init_process_group("nccl" if torch.device(device).type == "cuda" else "gloo")
-        from legged_torque.utils.shared_mean import SharedMean, can_share
+        from legged_torque.utils.shared_mean import ADDRESS, SharedMean
 
-        _shared = SharedMean(rank(), world_size()) if can_share() else None
+        _shared = SharedMean(rank(), world_size()) if ADDRESS in os.environ else None
     except ValueError as error:  # an environment variable that torchrun sets is missing
         raise UserError(f"WORLD_SIZE is {world_size()}, but torchrun has not started this process: {error}") from None
     except torch.distributed.DistError as error:

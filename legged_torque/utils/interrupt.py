@@ -56,5 +56,9 @@ class StopRequest:
 
 
 def write_error(text: str) -> None:
-    """Write a line to standard error from a signal's handler, where print fails inside another print."""
-    os.write(2, f"\n{text}\n".encode())
+    """Write a line to standard error from a signal's handler, where print fails inside another print.
+
+    The reader of a pipe may have ended by the same Ctrl-C; that must not end what is to be saved.
+    """
+    with contextlib.suppress(OSError):
+        os.write(2, f"\n{text}\n".encode())

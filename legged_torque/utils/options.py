@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from legged_torque.utils.config import section_keys, set_by_path, successor, update_from_dict
-from legged_torque.utils.errors import UserError, check_names, unknown_name
+from legged_torque.utils.config import checked_path, section_keys, set_by_path, update_from_dict
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.limits import Count, Number, Rate, Worlds, check_value, types_of
 from legged_torque.utils.plain_yaml import parse_yaml
 
@@ -113,10 +113,7 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
     sections = {key: cfg for cfg in (env_cfg, train_cfg) for key in section_keys(cfg)}
     for path, value in changes:
         section = path.split(".")[0]
-        if section not in sections:
-            if replaced := successor("settings", section):
-                raise UserError(replaced)
-            raise unknown_name("config section", section, sections)
+        checked_path("", section, list(sections))
         set_by_path(sections[section], path, value)
     train_cfg.refuse_unread(path for path, _ in changes)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.utils.errors import UserError, require, unknown_name
+from legged_torque.utils.errors import UserError, check_names, require
 from legged_torque.utils.files import is_whole_archive
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import CONFIG_FILE, checkpoint_file
@@ -36,10 +36,9 @@ def policy_dir(name: str, checkpoint: int | None = None) -> Path:
         return download_run(name.removeprefix(WANDB), checkpoint)
     if name.startswith(HUB):
         folder = download(name.removeprefix(HUB))
-    elif name in policy_names():
-        folder = POLICIES_DIR / name
     else:
-        raise unknown_name("policy", name, policy_names())
+        check_names("policy", [name], policy_names())
+        folder = POLICIES_DIR / name
     for file, checksum in read_card(folder)["files"].items():
         if not (folder / file).is_file() or sha256(folder / file) != checksum:
             raise UserError(f"'{folder / file}' is not the file that {CARD} describes")
@@ -69,8 +68,7 @@ def download_run(path: str, checkpoint: int | None) -> Path:
         if not numbers:
             raise ValueError("it holds no settings and checkpoint of train.py --logger wandb")
         chosen = max(numbers) if checkpoint is None else checkpoint
-        if chosen not in numbers:
-            raise unknown_name("checkpoint", str(chosen), map(str, numbers))
+        check_names("checkpoint", [str(chosen)], [*map(str, numbers)])
         for file in (run / CONFIG_FILE, checkpoint_file(run, chosen)):
             if not is_whole_archive(file):  # else it is here already
                 files[file].download(str(root), replace=True).close()  # a UserError for names that lead out of it

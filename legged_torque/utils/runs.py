@@ -6,6 +6,7 @@ import functools
 import importlib.metadata
 import math
 import platform
+import re
 import shlex
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from legged_torque import __version__
-from legged_torque.utils.errors import UserError, unknown_name
+from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.files import is_whole_archive, part_of, remove_stale_parts, write_errors, write_whole
 from legged_torque.utils.plain_yaml import dump_yaml, parse_yaml
 
@@ -74,6 +75,11 @@ def evaluations_file(run_dir: Path, environment: str = "") -> Path:
     return file.with_stem(tagged(file.stem, environment))
 
 
+def by_age(run_dir: Path) -> tuple[bool, str, Path]:
+    """Return a key that sorts runs by age: a name that begins with no date, as of a copy, is older than all others."""
+    return re.match(r"\d{4}-\d\d-\d\d_", run_dir.name) is not None, run_dir.name, run_dir
+
+
 def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
     """Return the folder of a run, or raise a UserError if there is none.
 
@@ -85,14 +91,13 @@ def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
     if load_run and Path(load_run).is_dir():
         folder = Path(load_run)
         return folder if folder.name.strip(".") else folder.resolve()  # "." and ".." are no names of runs
-    runs = sorted((path for path in root.glob(pattern) if checkpoint_numbers(path)), key=lambda path: (path.name, path))
+    runs = sorted((path for path in root.glob(pattern) if checkpoint_numbers(path)), key=by_age)
     if not runs:
         raise UserError(f"there is no run with a checkpoint in '{root}'; train first")
     if not load_run:
         return next(filter(newest_checkpoint, reversed(runs)), runs[-1])
+    check_names("run", [load_run], [path.name for path in runs])
     named = [path for path in runs if path.name == load_run]
-    if not named:
-        raise unknown_name("run", load_run, (path.name for path in runs))
     if len(named) > 1:
         raise UserError(f"there are several runs '{load_run}'; give the path of one: {', '.join(map(str, named))}")
     return named[0]
@@ -106,10 +111,9 @@ def find_checkpoint(run_dir: Path, checkpoint: int | None) -> Path:
     numbers = checkpoint_numbers(run_dir)
     if not numbers:
         raise UserError(f"there is no checkpoint in '{run_dir}'")
-    if checkpoint is not None and checkpoint not in numbers:
-        raise unknown_name("checkpoint", str(checkpoint), map(str, numbers))
     if checkpoint is None:
         return newest_checkpoint(run_dir) or checkpoint_file(run_dir, numbers[-1])
+    check_names("checkpoint", [str(checkpoint)], [*map(str, numbers)])
     return checkpoint_file(run_dir, checkpoint)
 
 

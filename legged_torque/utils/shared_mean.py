@@ -10,7 +10,7 @@ from torch import Tensor
 
 from legged_torque.utils.errors import LOST_PROCESS, UserError
 
-_ADDRESS, _KEY = "LEGGED_TORQUE_ADDRESS", "LEGGED_TORQUE_KEY"
+ADDRESS, _KEY = "LEGGED_TORQUE_ADDRESS", "LEGGED_TORQUE_KEY"
 """Environment variables: where the first process listens, and what the others must know to be heard."""
 _listeners: list[Listener] = []  # of the first process
 
@@ -18,13 +18,9 @@ _listeners: list[Listener] = []  # of the first process
 def listen() -> None:
     """Listen for the processes that this one is about to start, which find it by their environment."""
     key = secrets.token_bytes(16)
-    _listeners.append(Listener(backlog=64, authkey=key))
-    os.environ.update({_ADDRESS: str(_listeners[0].address), _KEY: key.hex()})
-
-
-def can_share() -> bool:
-    """Return whether the processes that train together have been started after a call of :func:`listen`."""
-    return _ADDRESS in os.environ
+    address = f"/tmp/legged_torque_{secrets.token_hex(8)}"  # TMPDIR may be too long for the name of a socket
+    _listeners.append(Listener(address, backlog=64, authkey=key))
+    os.environ.update({ADDRESS: str(_listeners[0].address), _KEY: key.hex()})
 
 
 class SharedMean:
@@ -36,7 +32,7 @@ class SharedMean:
 
     def __init__(self, rank: int, world_size: int) -> None:
         """Connect to the others: the first process to all, each other one to the first."""
-        self._rank, self._world_size, self._address = rank, world_size, os.environ[_ADDRESS]
+        self._rank, self._world_size, self._address = rank, world_size, os.environ[ADDRESS]
         self._rows: dict[int, Tensor] = {}  # by how many numbers are averaged. Shapes: (2, world_size, numbers)
         self._turns: dict[int, int] = {}
         if rank == 0:

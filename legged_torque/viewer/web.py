@@ -98,7 +98,7 @@ class Page:
         """Draw until closed; plots, controls and status less often than the robots."""
         next_plots = 0.0
         while not self._closed.wait(FRAME_INTERVAL):
-            self._attempt("scene", self._draw_scene)
+            self._attempt("scene", lambda: self._scene.update({name for name, box in self._boxes.items() if box.value}))
             self._attempt("recording", self._record_steps)
             if time.perf_counter() >= next_plots:
                 next_plots = time.perf_counter() + PLOT_INTERVAL
@@ -122,10 +122,6 @@ class Page:
             if self._errors.get(part) != text:
                 self._errors[part] = text
                 traceback.print_exc()
-
-    def _draw_scene(self) -> None:
-        """Draw the robots, with what users want to see."""
-        self._scene.update({name for name, box in self._boxes.items() if box.value})
 
     def _update_controls(self) -> None:
         """Show the session's values, unless a choice has not been carried out yet."""

@@ -14,7 +14,7 @@ from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
-from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher
+from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher, LocalProcess
 from legged_torque.experiments.matrix import CellState, read_matrix
 
 
@@ -97,6 +97,32 @@ def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0
     assert len(list(out.glob("*/result_*.json"))) == 4
     assert any(" from 2" in line for line in trained(stage)) == (behaviour == "early")
+
+
+def test_stop_where_nobody_reads(stage, tmp_path, monkeypatch):
+    """Trainings are asked once and save, too, if the reader of the output has ended by the same Ctrl-C."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (stage / "behaviour").write_text("slow")
+
+    def gone(*texts, **options):
+        """Print, but no word of stopping: the pipe is broken."""
+        if "Stopping" in texts[0]:
+            raise BrokenPipeError
+        print(*texts, **options)
+
+    def stop():
+        """Send the signal when the training is under way."""
+        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(experiment_run, "print", gone, raising=False)
+    asked, terminate = [], LocalProcess.terminate
+    monkeypatch.setattr(LocalProcess, "terminate", lambda self: asked.append(self) or terminate(self))
+    thread = threading.Thread(target=stop)
+    thread.start()
+    experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    thread.join()
+    assert len(asked) == 1 and max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
 
 
 def test_stop(stage, tmp_path):

@@ -19,7 +19,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: pip install -e .[ray]"
 
 import legged_torque
 from legged_torque.experiments import matrix, ray_launcher
-from legged_torque.experiments.ray_node import Report, write_files
+from legged_torque.experiments.ray_node import Report, new_files, write_files
 
 FAST = {
     "worker_niceness": 0,  # by default they wait for all other tests
@@ -166,6 +166,19 @@ def test_files_stay_in_their_folder(name, tmp_path):
     folder = tmp_path / "out"
     assert "would be written to" in error_of(write_files, folder, {"good": b"1", name: b"2"})
     assert not list(tmp_path.iterdir())
+
+
+def test_what_a_machine_sends(tmp_path):
+    """Files are sent when they are whole, even if they have been written before the last report, and once."""
+    (tmp_path / "config.yaml").write_bytes(b"1")
+    part, sent = tmp_path / "model_2.pt.17.part", {}
+    part.write_bytes(b"2")
+    assert new_files(tmp_path, sent) == {"config.yaml": b"1"}
+    part.rename(tmp_path / "model_2.pt")
+    assert new_files(tmp_path, sent) == {"model_2.pt": b"2"}
+    assert new_files(tmp_path, sent) == {}
+    (tmp_path / "config.yaml").write_bytes(b"10")
+    assert new_files(tmp_path, sent) == {"config.yaml": b"10"}
 
 
 def test_worlds_that_come_home_stay(tmp_path):

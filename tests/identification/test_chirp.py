@@ -12,9 +12,8 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.identification.recording import read_recording
 from legged_torque.runtime import chirp
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import Log, RecordedLog
-from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.runtime.sim_robot import InProcess, SimRobot
 
 RATE, SECONDS = 500.0, 6.0
 
@@ -86,6 +85,12 @@ def test_refused(policy, monkeypatch):
     chirp.confirm()
     monkeypatch.setattr(policy, "stiffness", 0.0 * policy.stiffness)
     assert "stiffness above 0" in error_of(chirp.Chirp, policy, RATE, SECONDS)
+
+
+def test_torques_that_are_not_refreshed(policy, monkeypatch):
+    """Those of the policy are held, sweeps act at every tick."""
+    monkeypatch.setitem(policy.description["timing"], "refresh_torques", False)
+    Controller(chirp.Chirp(policy, RATE, SECONDS), policy.joint_order, RATE)
 
 
 def test_slow_rates(policy):

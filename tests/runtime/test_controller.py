@@ -15,10 +15,9 @@ from legged_torque.envs import task_registry
 from legged_torque.runtime.brakes import Brakes, Joints, fault, limited, tilt_of
 from legged_torque.runtime.chirp import Chirp
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import MotorCommand, Received, RobotState
 from legged_torque.runtime.log import Log, RecordedLog
-from legged_torque.runtime.sim_robot import Faults, SimRobot
+from legged_torque.runtime.sim_robot import Faults, InProcess, SimRobot
 from legged_torque.utils.errors import UserError
 
 ALLOWED = round(0.02 * RATE)  # ticks until a fault must have ended in damping
@@ -149,6 +148,18 @@ def test_numbers_that_hide_others():
         numbers = np.where(np.arange(12) == 3, np.nan, np.where(np.arange(12) == 5, 130.0, 0.0))
         said = fault(replace(state, **{name: numbers}), 0.0, Received(), joints, Brakes())
         assert said == f"a measurement is not finite, of {name}"
+
+
+def test_error_flags_of_other_types():
+    """They may be negative or floats, as of a transport of one's own."""
+    state, wide = random_state(np.random.default_rng(0)), np.array([[-99.0] * 12, [99.0] * 12])
+    joints = Joints([f"joint {i}" for i in range(12)], wide, wide, wide[1])
+    for error, said in ((-2.0, "-0x2"), (16, "0x10")):
+        flags = np.where(np.arange(12) == 3, error, 0)
+        assert (
+            fault(replace(state, errors=flags), 0.0, Received(), joints, Brakes())
+            == f"joint 3 has {said} as error flag"
+        )
 
 
 def test_from_lying_to_walking_and_back(policy):

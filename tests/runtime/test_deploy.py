@@ -21,11 +21,10 @@ from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.brakes import Brakes
 from legged_torque.runtime.controller import Controller, Mode
 from legged_torque.runtime.dds import Go2Robot
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.loop import PRIORITY
 from legged_torque.runtime.session import Session
-from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.runtime.sim_robot import InProcess, SimRobot
 from legged_torque.runtime.view import View
 from legged_torque.utils.errors import UserError
 
@@ -195,9 +194,8 @@ def test_scripts_without_torch(exported, tmp_path):
 
 OWN = """
 from legged_torque import resource_path
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import JOINT_ORDER
-from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.runtime.sim_robot import InProcess, SimRobot
 
 class Mine(InProcess):
     def __init__(self):

@@ -12,10 +12,10 @@ from support.simulated import RATE, Simulated, robot_of
 
 from legged_torque.deploy.policy import Policy
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import Received
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.replay import same_actions, simulate
+from legged_torque.runtime.sim_robot import InProcess
 
 STAND, WALK = 1700, 150  # ticks of each
 DEAD = STAND + 60  # tick at which a motor dies

@@ -12,11 +12,11 @@ from support.simulated import RATE, World, robot_of, standing_at_once
 
 from legged_torque.runtime.brakes import Brakes
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.interface import Received
 from legged_torque.runtime.log import Log, RecordedLog
 from legged_torque.runtime.loop import BIN, RealTimeLoop
 from legged_torque.runtime.session import Session
+from legged_torque.runtime.sim_robot import InProcess
 
 ALLOWED = round(0.02 * RATE)  # ticks until a robot without commands must damp itself
 

@@ -3,9 +3,8 @@
 from legged_torque import resource_path
 from legged_torque.runtime.brakes import Brakes
 from legged_torque.runtime.controller import Controller, Mode
-from legged_torque.runtime.in_process import InProcess
 from legged_torque.runtime.session import Session
-from legged_torque.runtime.sim_robot import SimRobot
+from legged_torque.runtime.sim_robot import InProcess, SimRobot
 
 RATE = 500.0
 

@@ -46,6 +46,13 @@ def test_signal_while_printing(monkeypatch):
     assert stop.requested
 
 
+def test_broken_pipe():
+    """Ctrl-C also ends what reads the output, as ``tee`` does: it is still a request."""
+    code = "import os; from legged_torque.utils.interrupt import *; r, w = os.pipe(); os.dup2(w, 2); os.close(w); "
+    code += "os.close(r)\nwith StopRequest() as stop: signal.raise_signal(signal.SIGINT)\nprint(stop.requested)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True).stdout == "True\n"
+
+
 def test_under_nohup():
     """A terminal that closes does not ask to stop."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)

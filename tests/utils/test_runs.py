@@ -1,6 +1,7 @@
 """Run folders: found, read, and refused when they are broken."""
 
 import os
+import shutil
 import subprocess
 import time
 import zipfile
@@ -36,6 +37,9 @@ def test_find_run(log_root, monkeypatch):
     assert runs.find_run(log_root, None) == log_root / "2026-01-02_00-00-00_wide"
     assert runs.find_run(log_root, "2026-01-01_00-00-00") == log_root / "2026-01-01_00-00-00"
     assert runs.find_run(log_root, f"{log_root}/2026-01-03_00-00-00") == log_root / "2026-01-03_00-00-00"
+    shutil.copytree(log_root / "2026-01-01_00-00-00", log_root / "best")  # without a date, older than all others
+    assert runs.find_run(log_root, None) == log_root / "2026-01-02_00-00-00_wide"
+    assert runs.find_run(log_root, "best") == log_root / "best"
     (log_root / "2026-01-01_00-00-00" / "exported_2").mkdir()
     for folder, short in (("2026-01-03_00-00-00", "."), ("2026-01-01_00-00-00/exported_2", "..")):
         monkeypatch.chdir(log_root / folder)

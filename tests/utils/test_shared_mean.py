@@ -20,7 +20,7 @@ def numbers(rank, number):
 def test_means(monkeypatch):
     """Each process gets the mean of all, however slow the others are; those that are left hear of one that ends."""
     monkeypatch.setattr(shared_mean, "_listeners", [])
-    for name in (shared_mean._ADDRESS, shared_mean._KEY):
+    for name in (shared_mean.ADDRESS, shared_mean._KEY):
         monkeypatch.setenv(name, "")  # put back afterwards
     shared_mean.listen()
     results, lost = {}, []

@@ -119,6 +119,14 @@ def test_a_page_that_cannot_start_or_ends(run, capsys):
     assert error.count("Warning: nothing is shown of model_0: ") == error.count("Warning: the page has ended; ") == 1
 
 
+def test_pages_of_two_trainings():
+    """They are at different addresses, also before there is anything to show."""
+    first, second = (TrainingViewer(has_page=True, video_interval=0) for _ in range(2))
+    assert first.page != second.page
+    for viewer in (first, second):
+        viewer.close(is_waiting=False)
+
+
 def test_interrupted_training_does_not_wait(run):
     """The video that is being made is given up."""
     shown = TrainingViewer(has_page=False, video_interval=1)
