@@ -103,9 +103,10 @@ class Task(Stateful, Protocol):
     """A batch of worlds, with the counters that a checkpoint keeps as its state.
 
     Some methods are optional. ``make_evaluation(num_envs, perturbation)`` returns an :class:`Evaluation`; without it,
-    ``evaluation.interval`` must be 0. Worlds of a task with these three go on in a resumed training, others start anew:
-    ``identity()`` returns "settings" by dotted path and hashes by what they are of, which must not change, as plain
-    values; ``world_state_dict()`` and ``load_world_state_dict(state)`` are for tensors, in nested dictionaries.
+    ``evaluation.interval`` must be 0. ``control_law.weights()`` are those of actions in PPO's entropy. Worlds of a task
+    with these three go on in a resumed training, others start anew: ``identity()`` returns "settings" by dotted path
+    and hashes by what they are of, which must not change, as plain values; ``world_state_dict()`` and
+    ``load_world_state_dict(state)`` are for tensors, in nested dictionaries.
 
     Attributes:
         device: "cpu" or "cuda:N".
