@@ -55,7 +55,7 @@ class ExperimentRun:
         self._failures: list[str] = []  # a message per failed cell
         self._reported: set[Cell] = set()  # cells reported to be held by another process
         self._counted = self._shown = time.monotonic()
-        self._stop = CountedStop()
+        self._stop, self._unread = CountedStop(), 0
 
     def run(self) -> int:
         """Work until all cells are done or have failed; return the exit status. Asked to stop: KeyboardInterrupt."""
@@ -64,8 +64,8 @@ class ExperimentRun:
         try:
             with self._stop, self._display:
                 while self._running or (self._queue and not self._stop.requested):
-                    if self._stop.count > passed_on:
-                        passed_on = self._stop.count
+                    if (asked := max(self._stop.count, self._unread)) > passed_on:
+                        passed_on = asked
                         self._ask_to_stop()
                     self._count_time()
                     for steps, job in list(self._running.items()):
@@ -174,9 +174,11 @@ class ExperimentRun:
         return f"{self._num_done} of {self._num_cells} cells done, {times(self._display.tasks[0])}"
 
     def _print(self, text: str) -> None:
-        """Print a line with the time; where nobody reads any more, the work goes on."""
-        with contextlib.suppress(BrokenPipeError):
+        """Print a line with the time; where nobody reads any more (``| head``), ask to stop once, as Ctrl-C does."""
+        try:
             print(f"{datetime.now():%Y-%m-%d %H:%M:%S}  {text}", flush=True)
+        except BrokenPipeError:
+            self._stop.requested, self._unread = True, 1
 
     def _show(self) -> None:
         """Show a bar for all cells and one for each running step."""

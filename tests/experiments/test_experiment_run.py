@@ -125,6 +125,21 @@ def test_stop_where_nobody_reads(stage, tmp_path, monkeypatch):
     assert len(asked) == 1 and max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
 
 
+def test_nobody_reads(stage, tmp_path, monkeypatch):
+    """The trainings in work are asked to stop, and no other is begun."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+
+    def gone(*texts, **options):
+        """Print, but no word of what is done: the pipe is broken."""
+        if " took " in texts[0]:
+            raise BrokenPipeError
+        print(*texts, **options)
+
+    monkeypatch.setattr(experiment_run, "print", gone, raising=False)
+    assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 130
+    assert trained(stage) == ["a1_position-low-s1"]
+
+
 def test_stop(stage, tmp_path):
     """Trainings save before this process ends with status 130, and go on the next time."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
