@@ -146,7 +146,7 @@ def _check_sizes(description: dict[str, Any], where: str) -> None:
             raise UserError(f"{where}: the scale of the observation '{term['name']}' must have {term['size']} numbers")
     sizes = (len(columns(description["observations"])), len(terms) * len(description["joint_order"]))
     for kind, size in zip(("observations", "actions"), sizes, strict=True):
-        if not description["unsupported"] and size != network[f"num_{kind}"]:
+        if size != network[f"num_{kind}"]:
             raise UserError(f"{where}: {kind} have {size} numbers, those of the network {network[f'num_{kind}']}")
 
 

@@ -82,9 +82,9 @@ class ExperimentRun:
                     while job.process.poll() is None:
                         time.sleep(POLL)
         spent = describe(read_times(cell.folder) for cell in self._matrix.cells(self._out))
-        print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         for failure in self._failures:
             print(failure, file=sys.stderr)
+        print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         if self._stop.requested:
             raise KeyboardInterrupt
         return 1 if self._failures else 0

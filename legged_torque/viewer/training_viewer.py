@@ -36,9 +36,11 @@ class TrainingViewer:
         for extra, is_wanted in (("viewer", has_page), ("video", video_interval > 0)):
             if is_wanted:
                 require(*EXTRAS[extra], extra=extra)
-        self._held = first_free(HOST, PORT) if has_page else None  # for the page, so that no other training takes it
-        self._port = self._held.getsockname()[1] if self._held else 0
-        self.page = f"http://{HOST}:{self._port}" if self._held else ""
+        self._port = free_port(HOST, PORT) if has_page else 0
+        self._held = socket.socket()  # until the page starts, so that no other training finds the port free
+        with contextlib.suppress(OSError):  # connections of an earlier page end there
+            self._held.bind((HOST, self._port))
+        self.page = f"http://{HOST}:{self._port}" if has_page else ""
         self._video_interval, self._next_video = video_interval, 0
         self._page: subprocess.Popen[bytes] | None = None
         self._video: subprocess.Popen[bytes] | None = None
@@ -52,7 +54,7 @@ class TrainingViewer:
         words, number = [*task_words, f"--load_run={checkpoint.parent}"], checkpoint_number(checkpoint)
         page_log, video_log = checkpoint.parent / "page.log", checkpoint.parent / "videos" / f"{checkpoint.stem}.log"
         try:
-            if self._held and self.page and not self._page:
+            if self.page and not self._page:
                 self._held.close()
                 self._page = start([*words, "--viewer=web", f"--port={self._port}"], page_log)
             if self.page and self._page and self._page.poll() is not None:
@@ -68,8 +70,7 @@ class TrainingViewer:
 
     def close(self, is_waiting: bool) -> None:
         """End the page and, unless it is waited for, the video."""
-        if self._held:
-            self._held.close()
+        self._held.close()
         if self._page:
             end(self._page)
         if not self._video:
@@ -119,16 +120,11 @@ def end(process: subprocess.Popen[bytes]) -> None:
 
 def free_port(host: str, port: int) -> int:
     """Return the first free port from a port on; a UserError for an address that is not this machine's."""
-    with first_free(host, port) as held:
-        return held.getsockname()[1]
-
-
-def first_free(host: str, port: int) -> socket.socket:
-    """Return a socket that holds the first free port from a port on, as :func:`free_port`."""
     for candidate in range(port, 65536):
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            return socket.create_server((host, candidate), family=family)
+            with socket.create_server((host, candidate), family=family):
+                return candidate
         except OSError as error:
             if error.errno != errno.EADDRINUSE:  # viser would try all ports forever
                 raise UserError(f"cannot serve at {host}:{candidate}: {error.strerror or error}") from None

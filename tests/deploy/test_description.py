@@ -13,6 +13,7 @@ from support.exports import change
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
+from legged_torque.deploy.description import check
 from legged_torque.deploy.export import write_description
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.simulation import evaluate
@@ -38,6 +39,13 @@ def test_damaged_descriptions(exported, description, tmp_path, path, value, mess
     change(path, value)(damaged)
     (folder / "policy.yaml").write_text(yaml.safe_dump(damaged, sort_keys=False))
     assert message in error_of(Policy, folder)
+
+
+def test_descriptions_of_older_exports(description):
+    """Those of d8439d6 lack the list of what is unsupported."""
+    older = copy.deepcopy(description)
+    del older["unsupported"]
+    check(older)
 
 
 def test_notes_of_strangers(exported, description, tmp_path, monkeypatch):

@@ -42,7 +42,7 @@ class TorchPPO(PPO):
         order: The samples of a rollout, in the order of an epoch. Shape: (batch_size * num_mini_batches,), int64.
         indices: Those of the minibatch that is learned from. Shape: (batch_size,), int64.
         update_graph: An epoch, which takes a gradient step on each minibatch of ``order``.
-        action_weights: Weights of the actions in the entropy. Shape: (num_actions,).
+        action_weights: Weights of the actions in the entropy of our distribution. Shape: (num_actions,).
         product_dtype: Numbers that matrix products take; those of float32 may be TF32.
         mirrored: The mirror image of all parameters, of equivariant networks; else None.
     """
