@@ -126,7 +126,7 @@ def last_export(log_root: Path) -> Path:
     if not exports:
         raise UserError(f"there is no exported policy in '{log_root}'; run export.py first, or name a policy")
     of_run = {file: (file.parents[1] / CONFIG_FILE).is_file() for file in exports}  # not of a policy from elsewhere
-    return max(exports, key=lambda file: (of_run[file], by_age(file.parents[1])[:2], file.stat().st_mtime)).parent
+    return max(exports, key=lambda file: (of_run[file], by_age(file.parents[1]), file.stat().st_mtime)).parent
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ class ExperimentRun:
                     while job.process.poll() is None:
                         time.sleep(POLL)
         spent = describe(read_times(cell.folder) for cell in self._matrix.cells(self._out))
-        for failure in self._failures:
+        for failure in self._failures:  # first, as the next line ends it all where nobody reads
             print(failure, file=sys.stderr)
         print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         if self._stop.requested:

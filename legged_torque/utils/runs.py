@@ -75,9 +75,9 @@ def evaluations_file(run_dir: Path, environment: str = "") -> Path:
     return file.with_stem(tagged(file.stem, environment))
 
 
-def by_age(run_dir: Path) -> tuple[bool, str, Path]:
+def by_age(run_dir: Path) -> tuple[bool, str]:
     """Return a key that sorts runs by age: a name that begins with no date, as of a copy, is older than all others."""
-    return re.match(r"\d{4}-\d\d-\d\d_", run_dir.name) is not None, run_dir.name, run_dir
+    return re.match(r"\d{4}-\d\d-\d\d_", run_dir.name) is not None, run_dir.name
 
 
 def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
@@ -91,7 +91,7 @@ def find_run(root: Path, load_run: str | None, pattern: str = "*") -> Path:
     if load_run and Path(load_run).is_dir():
         folder = Path(load_run)
         return folder if folder.name.strip(".") else folder.resolve()  # "." and ".." are no names of runs
-    runs = sorted((path for path in root.glob(pattern) if checkpoint_numbers(path)), key=by_age)
+    runs = sorted(filter(checkpoint_numbers, root.glob(pattern)), key=lambda path: (by_age(path), path))
     if not runs:
         raise UserError(f"there is no run with a checkpoint in '{root}'; train first")
     if not load_run:

@@ -20,7 +20,7 @@ def listen() -> None:
     key = secrets.token_bytes(16)
     address = f"/tmp/legged_torque_{secrets.token_hex(8)}"  # TMPDIR may be too long for the name of a socket
     _listeners.append(Listener(address, backlog=64, authkey=key))
-    os.environ.update({ADDRESS: str(_listeners[0].address), _KEY: key.hex()})
+    os.environ.update({ADDRESS: address, _KEY: key.hex()})
 
 
 class SharedMean:

@@ -235,7 +235,7 @@ class TaskRegistry:
             print_notes(robot_notes(resource_path(robot), resource_path(trained)))
         file = runs.find_checkpoint(folder, options.checkpoint)
         others = filter(runs.checkpoint_numbers, root.glob(pattern))
-        are_newer = not chosen and any(runs.by_age(other)[:2] > runs.by_age(folder)[:2] for other in others)
+        are_newer = not chosen and any(runs.by_age(other) > runs.by_age(folder) for other in others)
         is_last = runs.checkpoint_number(file) == runs.checkpoint_numbers(folder)[-1]
         if are_newer or (options.checkpoint is None and not is_last):
             print(f"Newer checkpoints than '{file}' are damaged; taking this one.")

@@ -38,8 +38,9 @@ class TrainingViewer:
                 require(*EXTRAS[extra], extra=extra)
         self._port = free_port(HOST, PORT) if has_page else 0
         self._held = socket.socket()  # until the page starts, so that no other training finds the port free
-        with contextlib.suppress(OSError):  # connections of an earlier page end there
-            self._held.bind((HOST, self._port))
+        if has_page:
+            with contextlib.suppress(OSError):  # connections of an earlier page end there
+                self._held.bind((HOST, self._port))
         self.page = f"http://{HOST}:{self._port}" if has_page else ""
         self._video_interval, self._next_video = video_interval, 0
         self._page: subprocess.Popen[bytes] | None = None
