@@ -14,7 +14,6 @@ from torch.utils._pytree import tree_map
 
 from legged_torque.envs import task_registry
 from legged_torque.learning.checkpoint import cloned
-from legged_torque.learning.equivariance import MirroredWeights
 from legged_torque.learning.memory import RememberingPolicy
 from legged_torque.learning.protocols import Transition, annealed
 from legged_torque.sim.graph import CudaGraph
@@ -67,11 +66,6 @@ class Distillation(algorithms.Distillation):
         worlds = max(env.num_envs // minibatches, 1)
         self._worlds = torch.zeros(worlds, dtype=torch.long, device=device)  # of a gradient step
         self._steps = torch.zeros(length, 1, dtype=torch.long, device=device)
-        symmetry = cfg["algorithm"]["symmetry_cfg"]
-        is_symmetric = symmetry["use_data_augmentation"] and symmetry["use_equivariant_networks"]
-        self.mirrored = MirroredWeights(env.mirror.maps, student) if is_symmetric else None
-        if self.mirrored:
-            self.mirrored.make_symmetric()
         self._at_start: tuple[Tensor, ...] = ()  # what the student remembered when the rollout began
         self._memory: tuple[Tensor, ...] = ()  # what it remembers of the worlds of a gradient step
         self.update_graph = CudaGraph(self._learn, device, cfg["capture"])
@@ -171,8 +165,6 @@ class Distillation(algorithms.Distillation):
         loss.backward()
         if self.is_multi_gpu:
             distributed.average([value.grad for value in self.student.parameters() if value.grad is not None])
-        if self.mirrored:
-            self.mirrored.average_gradients()
         norm = nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
         self._skip.copy_(~torch.isfinite(norm))
         self.optimizer.step()
@@ -233,8 +225,6 @@ class Distillation(algorithms.Distillation):
         if load_cfg is None or load_cfg.get("actor"):
             self.student.load_state_dict(state["actor_state_dict"], strict)
         if load_cfg is None:
-            if self.mirrored:
-                self.mirrored.check()
             self.optimizer.load_state_dict(state["optimizer_state_dict"])
             self.optimizer.param_groups[0].update(lr=self.learning_rate, fused=True, capturable=True)
             self.update_graph.reset()  # the optimizer's tensors are new

@@ -26,8 +26,6 @@ from legged_torque.utils.task_registry import LoadedRun
 
 WORLDS, STEPS, OBS, ACTIONS = 3, 8, 5, 2
 WEIGHTS = [0.0, 1.0]  # of the actions' torques
-MIRROR = {"policy": ([1, 0, 2, 3, 4], [1.0, 1.0, -1.0, 1.0, -1.0]), "actions": ([0, 1], [-1.0, 1.0])}
-MIRROR["more"] = MIRROR["actions"]
 SMALL = ["--device=cpu", "--num_envs=4", "--logger=none", "--set=runner.num_steps_per_env=4"]
 SMALL += ["--set=evaluation.interval=16", "--set=evaluation.num_samples=20"]
 OF_TEACHER = ["--task=a1_position", "--set=actor.hidden_dims=[8]", "--set=critic.hidden_dims=[8]"]
@@ -69,20 +67,16 @@ def observations():
     return TensorDict({"policy": torch.randn(WORLDS, OBS), "more": torch.randn(WORLDS, ACTIONS)}, [WORLDS])
 
 
-def make_learner(symmetric=False, **settings):
+def make_learner(**settings):
     """A learner in a task of which only the observations are known."""
     cfg = to_dict(DistillationCfg()) | {"num_learning_epochs": 1, "num_mini_batches": 1, "gradient_length": STEPS}
     cfg |= settings
     cfg["student"] |= {"rnn_hidden_dim": 4, "hidden_dims": [3], "rnn_type": settings.pop("rnn_type", "gru")}
     cfg["student"]["rnn_num_layers"] = settings.pop("layers", 1)
     train_cfg = {"distillation": cfg, "num_steps_per_env": STEPS, "obs_groups": {"actor": ["policy"]}}
-    symmetry = {"use_data_augmentation": symmetric, "use_equivariant_networks": True}
-    train_cfg["algorithm"] = {"symmetry_cfg": symmetry}
     train_cfg |= {"pretraining": {"function": ""}, "multi_gpu": None, "capture": False}
     env = SimpleNamespace(num_envs=WORLDS, num_actions=ACTIONS, device="cpu", get_observations=observations)
     env.terrain, env.control_law = None, SimpleNamespace(weights=lambda: torch.tensor(WEIGHTS))
-    maps = {name: (torch.tensor(order), torch.tensor(signs)) for name, (order, signs) in MIRROR.items()}
-    env.mirror = SimpleNamespace(maps=maps)
     alg = Distillation.construct_algorithm(observations(), env, train_cfg, "cpu")
     alg.teacher = Wise()
     return alg
@@ -118,59 +112,20 @@ def by_hand(student, seen, ends, hidden):
     return loss, hidden
 
 
-def mirrored(obs):
-    """The mirror image of observations."""
-    return TensorDict(
-        {name: obs[name][:, order] * torch.tensor(signs) for name, (order, signs) in MIRROR.items() if name in obs},
-        obs.batch_size,
-    )
-
-
-@pytest.mark.parametrize("symmetric", [False, True])
-def test_gradients_go_back_in_time(symmetric):
-    """An update's gradients are those of the loss of the rollout, but not through ends of episodes and rollouts.
-
-    Those of an equivariant student are the mean of these and of the mirrored rollout's.
-    """
+def test_gradients_go_back_in_time():
+    """An update's gradients are those of the loss of the rollout, but not through ends of episodes and rollouts."""
     torch.manual_seed(0)
-    alg = make_learner(symmetric, max_grad_norm=1e9)
-    sides = [lambda obs: obs, mirrored][: 1 + symmetric]
-    hidden = [torch.zeros(WORLDS, 4) for _ in sides]
+    alg, hidden = make_learner(max_grad_norm=1e9), torch.zeros(WORLDS, 4)
     for _ in range(3):
         seen, ends = roll_out(alg)
         assert any(dones.any() for dones in ends)
+        loss, hidden = by_hand(alg.student, seen, ends, hidden.detach())
         learned = [value for name, value in alg.student.named_parameters() if not name.startswith("distribution")]
-        expected, losses = [torch.zeros_like(value) for value in learned], []
-        for side, image in enumerate(sides):
-            loss, hidden[side] = by_hand(alg.student, [image(obs) for obs in seen], ends, hidden[side].detach())
-            for total, part in zip(expected, torch.autograd.grad(loss, learned), strict=True):
-                total += part / len(sides)
-            losses.append(float(loss.detach()) / STEPS)
-        assert alg.update()["behavior"] == pytest.approx(losses[0], rel=1e-5)
-        assert losses[-1] == pytest.approx(losses[0], rel=1e-5)
+        expected = torch.autograd.grad(loss, learned)
+        numbers = alg.update()
+        assert numbers["behavior"] == pytest.approx(float(loss.detach()) / STEPS, rel=1e-5)
         for parameter, gradient in zip(learned, expected, strict=True):
             torch.testing.assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize(("rnn_type", "layers"), [("gru", 2), ("lstm", 1), ("none", 1)])
-def test_both_sides_are_alike(rnn_type, layers):
-    """After learning, and with a memory, the actions of an equivariant student are mirrored when observations are."""
-    torch.manual_seed(0)
-    alg = make_learner(symmetric=True, rnn_type=rnn_type, layers=layers, learning_rate=0.03)
-    before = copy.deepcopy(alg.student.state_dict())
-    for _ in range(5):
-        roll_out(alg)
-        alg.update()
-    assert not any(
-        torch.equal(value, before[name]) for name, value in alg.student.mlp.state_dict(prefix="mlp.").items()
-    )
-    episode, actions = [observations() for _ in range(4)], []
-    with torch.no_grad():
-        for image in (lambda obs: obs, mirrored):
-            alg.student.reset()
-            actions.append(torch.stack([alg.student(image(obs)) for obs in episode]))
-    torch.testing.assert_close(actions[1], actions[0] * torch.tensor(MIRROR["actions"][1]), rtol=1e-4, atol=1e-6)
-    assert actions[0].abs().max() > 0.01
 
 
 def test_steps_without_finite_gradients_are_skipped():

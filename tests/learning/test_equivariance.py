@@ -96,10 +96,10 @@ class Own(OnDevicePPO):
 def test_mirror_images_that_have_no_weights():
     """Those of positions may not be torques of a multi-head actor, and mirroring twice changes nothing."""
     alg, maps = build(OnDevicePPO, multi_head=True), Mirrored("cpu").maps
-    assert len(MirroredWeights(maps, alg.actor, alg.critic).order) == sum(map(torch.numel, alg._parameters))
+    assert len(MirroredWeights(alg.actor, alg.critic, maps).order) == sum(map(torch.numel, alg._parameters))
     maps["actions"] = torch.tensor([3, 4, 5, 0, 1, 2]), torch.ones(6)
     with pytest.raises(UserError, match="the mirror images of positions are torques"):
-        MirroredWeights(maps, alg.actor, alg.critic)
+        MirroredWeights(alg.actor, alg.critic, maps)
     for mirroring in (Mirroring((1, 2, 0), (1.0, 1.0, 1.0)), Mirroring((1, 0), (1.0, -1.0))):
         with pytest.raises(UserError, match="mirrored twice, 'wheels' in 'policy' is not what it was"):
             Mirror({"policy": [("height", SCALAR), ("wheels", mirroring)]}, "", "cpu")

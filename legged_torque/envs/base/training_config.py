@@ -31,11 +31,7 @@ READ = {
         *(f"algorithm.{name}" for name in ("class_name", "gamma", "use_mixed_precision")),
         *(f"algorithm.symmetry_cfg.{name}" for name in ("use_data_augmentation", "data_augmentation_func")),
     ),
-    DISTILLATION: (
-        "distillation.",
-        "algorithm.class_name",
-        *(f"algorithm.symmetry_cfg.{name}" for name in ("use_data_augmentation", "use_equivariant_networks")),
-    ),
+    DISTILLATION: ("distillation.", "algorithm.class_name"),
 }
 """Beginnings of the paths of those settings that a learner reads; a user's own may read all."""
 

@@ -11,6 +11,7 @@ from rsl_rl.storage import RolloutStorage
 from rsl_rl.utils import resolve_callable
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn.utils import parameters_to_vector
 
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.learning.checkpoint import cloned
@@ -76,7 +77,7 @@ class TorchPPO(PPO):
         self.mirrored: MirroredWeights | None = None
         if symmetry.pop("use_equivariant_networks", False) and replaces_images(symmetry, actor, critic):
             with contextlib.suppress(UserError):  # an unknown mirror image is reported when training starts
-                self.mirrored = MirroredWeights(symmetry["env"].mirror.maps, actor, critic)
+                self.mirrored = MirroredWeights(actor, critic, symmetry["env"].mirror.maps)
         if not self.mirrored and symmetry and (symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]):
             kwargs["symmetry_cfg"] = symmetry
         super().__init__(actor, critic, storage, learning_rate=learning_rate, optimizer=optimizer, **kwargs)
@@ -92,7 +93,9 @@ class TorchPPO(PPO):
         self._parts = [list(model.parameters()) for model in (self.actor, self.critic)]  # each is clipped by itself
         self._parameters = [*self._parts[0], *self._parts[1]]
         if self.mirrored:
-            self.mirrored.make_symmetric()
+            weights = self.mirrored.symmetric(parameters_to_vector(self._parameters))
+            for parameter, part in zip(self._parameters, self._split(weights), strict=True):
+                parameter.data.copy_(part)
         make_optimizer = type(self.optimizer)
         self.optimizer = make_optimizer(self._parameters, lr=self.learning_rate, fused=True, capturable=True)
         self.actor_learns = torch.ones((), device=self.device)
@@ -227,8 +230,10 @@ class TorchPPO(PPO):
         """
         learning_rate = self.learning_rate
         load_iteration = super().load(loaded_dict, load_cfg, strict)
-        if load_cfg is None and self.mirrored:
-            self.mirrored.check()
+        weights = parameters_to_vector(self._parameters)
+        if load_cfg is None and self.mirrored and not self.mirrored.is_symmetric(weights):
+            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
+            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
@@ -300,7 +305,9 @@ class TorchPPO(PPO):
         if self.is_multi_gpu:
             distributed.average([*(parameter.grad for parameter in self._parameters if parameter.grad is not None), kl])
         if self.mirrored:
-            self.mirrored.average_gradients()
+            gradient = torch.cat([parameter.grad.flatten() for parameter in self._parameters])
+            for parameter, part in zip(self._parameters, self._split(self.mirrored.averaged(gradient)), strict=True):
+                parameter.grad = part
         if self.schedule == "adaptive":
             lower = kl > 2.0 * self.kl_target
             higher = (kl < 0.5 * self.kl_target) & (kl > 0.0)
@@ -314,6 +321,11 @@ class TorchPPO(PPO):
         numbers = torch.cat([numbers, torch.stack([gradient_norm, norms[1]])])
         kept = torch.where(self._skip.bool(), 0.0, numbers)
         self.losses += torch.cat([kept, self._skip.unsqueeze(0)])
+
+    def _split(self, values: Tensor) -> list[Tensor]:
+        """Return numbers, one per parameter, in the shapes of the parameters."""
+        parts = values.split([parameter.numel() for parameter in self._parameters])
+        return [part.view_as(parameter) for part, parameter in zip(parts, self._parameters, strict=True)]
 
     def _gather(self) -> RolloutStorage.Batch:
         """Return the samples of ``indices`` from the stored rollout."""
