@@ -210,15 +210,21 @@ def test_students():
         """How many percent fewer robots of each student cross the kind on which it is worst."""
         return pd.concat([less(crossed, policy, trained, teacher).max(axis=1) for policy in policies])
 
-    own, students = "equivariant teacher", [f"its student, seed {seed}" for seed in (1, 2)]
+    own, students = "teacher, 70d6345", [f"student, 70d6345, seed {seed}" for seed in (1, 2)]
     lost = pd.concat([less(tracked, policy, trained, own).max(axis=1) for policy in students])
-    assert len(lost) == 8 and f"track at most {lost.max():.1f}% less" in text
-    fewer = of_worst_kind(students, own)
-    first, second, third, go2 = (fewer[key] for key in (("a1", 1), ("a1", 2), ("a1", 3), ("go2", 1)))
-    assert "{:.1f} and {:.1f}% fewer cross (first A1), {:.1f} and {:.1f}% (second),".format(*first, *second) in text
-    assert "{:.1f} and {:.1f}% (third), {:.1f} and {:.1f}% (Go2)".format(*third, *go2) in text
+    assert len(lost) == 10 and f"track at most {lost.max():.1f}% less" in text
+    kinds = pd.concat([less(crossed, policy, trained, own).idxmax(axis=1) for policy in students])
+    assert set(kinds) == {"discrete_obstacles"}
+    fewer = of_worst_kind(students, own).groupby(level=["robot", "seed"])
+    said = ", ".join("{:.1f} and {:.1f}%".format(*each) for _, each in fewer)
+    assert f"On the worst kind, obstacles, {said} fewer cross;" in text and len(fewer) == 5
+    sides = of_worst_kind([f"student, 70d6345, equivariant, seed {seed}" for seed in (1, 2)], own)
+    assert len(sides) == 10 and f"students ({sides.min():.1f} to {sides.max():.1f}%), LSTMs" in text
     older = of_worst_kind(f"student, seed {seed}" for seed in (1, 2, 3))
-    assert len(older) == 7 and f"of older teachers, {older.min():.1f} to {older.max():.1f}% (585b64c)" in text
+    before = of_worst_kind([f"its student, seed {seed}" for seed in (1, 2)], "equivariant teacher")
+    before = pd.concat([older, before])
+    said = f"of fifteen students before (585b64c, 0012629), {before.min():.1f} to {before.max():.1f}%."
+    assert len(before) == 15 and said in text
     lstm = of_worst_kind(f"student, seed {seed}, lstm" for seed in (1, 2, 3, 4))
     assert len(lstm) == 8 and f"LSTMs ({lstm.min():.1f} to {lstm.max():.1f}%)" in text
     equal = of_worst_kind(["student, 120 million"])
