@@ -16,9 +16,10 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -186,8 +187,11 @@ def outside(args: argparse.Namespace, trained: str) -> Any:
                 raise
             raise UserError(f"'{args.interface}' must be a class that is made without arguments: {error}") from None
         joints, limits = (getattr(transport, name, None) for name in ("joint_order", "torque_limits"))
-        if not (isinstance(joints, Sized) and isinstance(limits, Sized) and len(joints) == len(limits)):
-            raise UserError(f"'{args.interface}' must have joint_order and as many torque_limits")
+        for part, kind in ((joints, str), (limits, Real)):
+            if not (isinstance(part, Collection) and all(isinstance(each, kind) for each in part)):
+                raise UserError(f"'{args.interface}' must have joint_order, names, and torque_limits, numbers")
+        if len(joints) != len(limits):
+            raise UserError(f"'{args.interface}' must have as many torque_limits as joints")
         return transport
     if args.interface == "sdk":
         from legged_torque.runtime.legged_sdk import LeggedSdkRobot

@@ -48,9 +48,12 @@ def main() -> None:
         from legged_torque.identification.fit import ROUNDS, identify
         from legged_torque.identification.recording import read_recording
         from legged_torque.identification.worlds import FIELDS, PARAMETERS
+        from legged_torque.runtime.chirp import CHECKSUM
         from legged_torque.runtime.log import RecordedLog
         from legged_torque.utils.display import Counter
     log = RecordedLog(args.log)
+    if log.sha256 != CHECKSUM:
+        raise UserError(f"'{args.log}' is no log of deploy.py --chirp, in which a robot hangs")
     cfg, recording = task_registry.get_cfgs(log.task)[0], read_recording(log)
     with Counter("identifying, round", ROUNDS) as counter:
         found = identify(cfg, recording, resolve_device(args.device), counter.add)

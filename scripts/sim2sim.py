@@ -15,6 +15,7 @@ from legged_torque import resource_path
 from legged_torque.deploy.description import DESCRIPTION_FILE
 from legged_torque.envs import LeggedRobotCfg, task_registry
 from legged_torque.utils import cli
+from legged_torque.utils.config import update_from_dict
 from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, counted, printable
 from legged_torque.utils.files import write_json
@@ -81,10 +82,11 @@ def main() -> None:
     if args.motors:
         cfg = task_registry.get_cfgs(policy.description["task"])[0]
         cfg.motors.restore(policy.description.get("motors", {}))
+        update_from_dict(cfg.motors, {"delay": policy.description.get("latency", {}).get("actions", {})})
         delay = choose_motors(cfg, args.motors)
         policy.description["motors"] = cfg.motors.describe()
-        if delay:
-            policy.description.setdefault("latency", {})["actions"] = getattr(cfg.motors, delay).described()
+        if delay:  # as identify.py finds it: with that of measurements
+            policy.description["latency"] = {"actions": getattr(cfg.motors, delay).described()}
     if args.terrain:
         select_ground(policy.description, LeggedRobotCfg().terrain, args.terrain, args.level)
     xml = args.xml or resource_path(policy.description["robot"]["file"])

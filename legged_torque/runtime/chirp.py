@@ -1,5 +1,6 @@
 """Sweeps of all joints of a robot that hangs in the air, in place of a policy, for identify.py."""
 
+import contextlib
 import sys
 
 import numpy as np
@@ -81,5 +82,8 @@ def confirm() -> None:
     if not sys.stdin.isatty():
         raise UserError("--chirp asks whether the robot hangs, and needs a terminal for that")
     print("All legs will move fast, for as long as --chirp says. Nobody and nothing may be within their reach.")
-    if input(f"If the robot hangs in the air, held firmly by its trunk, type '{ANSWER}': ").strip() != ANSWER:
+    answer = ""
+    with contextlib.suppress(EOFError):
+        answer = input(f"If the robot hangs in the air, held firmly by its trunk, type '{ANSWER}': ")
+    if answer.strip() != ANSWER:
         raise UserError("--chirp is only for robots that hang")

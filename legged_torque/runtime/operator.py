@@ -131,7 +131,7 @@ class Datagrams(Operator):
     """JSON datagrams over UDP, such as ``{"forward": 0.5, "sideways": 0, "turn": 0.2, "mode": "policy"}``.
 
     A number that is left out is 0. A mode other than damping is asked for if the datagram before had another one, or
-    none, so that a stream of the same does not raise a robot again after a fault.
+    none, so that a stream of the same does not raise a robot after a fault or a refusal.
     """
 
     _bad, _heard, _mode = 0, np.inf, ""

@@ -52,23 +52,22 @@ class Gap:
 def simulate(log: RecordedLog, robot: SimRobot) -> Gap:
     """Give a simulated robot, which begins in the first state of the log, all commands of the log, each in time.
 
-    Where the program was late, a robot that keeps time has gone on under the command before. A UserError if the log has
-    no states.
+    Where the program was late, a robot that keeps time has gone on under the command before. Ticks without a state are
+    not compared. A UserError if the log has no states.
     """
     times, logged, simulated = [], [], []
-    state, start = None, 0.0
+    has_begun, start = False, 0.0
     for time, newest, command, _ in log.ticks():
-        if state is None and newest is not None:
+        if newest is not None and not has_begun:
             robot.lie_down(newest.joint_positions, newest.quaternion)
-            start = time
-        state = newest or state
-        if state is not None and log.keeps_time:
+            has_begun, start = True, time
+        if has_begun and log.keeps_time:
             for _ in range(round((time - start - robot.data.time) / log.period)):
                 robot.step(Received())
         said, _ = robot.says()
-        if state is not None and said is not None:
+        if newest is not None and said is not None:
             times.append(time)
-            logged.append(state.joint_positions)
+            logged.append(newest.joint_positions)
             simulated.append(said.joint_positions)
         robot.step(Received(command))
     if not times:

@@ -256,7 +256,7 @@ def run_script(main: Callable[[], None], draws: bool = False) -> None:
         elif isinstance(error, OSError):
             message = f"{error.strerror or error}" + (f": {str(error.filename)!r}" if error.filename else "")
         elif isinstance(error, ModuleNotFoundError) and not str(error.name).startswith("legged_torque"):
-            message = f"'{error.name}' is not installed; pip install legged_torque brings it along"
+            message = f"'{error.name}' is not installed"
         elif is_out_of_memory(error):
             reason = (str(error).strip() or "no reason is given").splitlines()[0]
             message = f"this does not fit in memory, lower --num_envs: {reason}"

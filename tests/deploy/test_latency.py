@@ -59,20 +59,26 @@ class BusCfg(A1TorqueCfg):
 
 @pytest.mark.parametrize("link", ["delay", "bus"])
 def test_delay_of_a_file_of_motors(make_task, tmp_path, monkeypatch, link):
-    """sim2sim.py takes it in place of the export's, also if it is 0, or has another name."""
+    """sim2sim.py takes it in place of all of the export's, also if it is 0, or has another name."""
     monkeypatch.setattr(task_registry, "_tasks", dict(task_registry._tasks))
     task_registry.register("a1_bus", TorqueRobot, BusCfg(), A1TorqueCfgPPO())
     for name, delay in (("late", [4, 4]), ("ideal", [0, 0])):
         task = "a1_bus" if link == "bus" else "a1_torque"
         export_random(make_task, task, tmp_path / name, **{f"motors.{link}.range": delay})
         (tmp_path / f"{name}.yaml").write_text(f"motors: {{{link}: {{range: {delay}}}}}")
+    measured = {f"motors.{link}.range": [2, 2], "sensing.delay.range": [2, 2]}
+    export_random(make_task, task, tmp_path / "measured", **measured)
+    (tmp_path / "part.yaml").write_text("motors: {delay: {jitter: 0}}")
     found = {}
-    for name, motors in product(("late", "ideal"), (None, "late.yaml", "ideal.yaml")):
+    for name, motors in product(("late", "ideal", "measured"), (None, "late.yaml", "ideal.yaml", "part.yaml")):
         words = [name, "--robots=1", "--steps=20", "--json=out.json", *([f"--motors={motors}"] if motors else [])]
         assert run_here("sim2sim.py", *words, root=tmp_path)[0] == 0
         found[name, motors] = json.loads((tmp_path / "out.json").read_text())["metrics"]
     assert found["late", "ideal.yaml"] == found["ideal", "ideal.yaml"] != found["late", None]
     assert found["late", "late.yaml"] == found["ideal", "late.yaml"] == found["late", None]
+    assert found["measured", "late.yaml"] == found["late", None] != found["measured", None]
+    if link == "delay":
+        assert found["late", "part.yaml"] == found["late", None]
 
 
 def test_a_file_of_motors_changes_what_it_names(make_task, tmp_path):

@@ -1,5 +1,7 @@
 """The motion that drives are identified from, with the brakes of any policy."""
 
+import io
+
 import numpy as np
 import pytest
 from support.exports import export_random
@@ -50,7 +52,7 @@ def test_targets(policy):
 def test_hanging_robot(exported, policy, tmp_path):
     """A simulated robot goes through all of it without a fault, its trunk at rest; the log is for identify.py.
 
-    Another one, which replay.py hangs up as tilted as that, does the same.
+    Another one, which replay.py hangs up as tilted as that, does the same wherever the log has a state.
     """
     sweeps = chirp.Chirp(policy, RATE, SECONDS)
     robot = SimRobot(resource_path(policy.description["robot"]["file"]), policy.joint_order, RATE, hangs=True)
@@ -59,6 +61,7 @@ def test_hanging_robot(exported, policy, tmp_path):
     session = Simulated(controller, InProcess(robot), Log(tmp_path / "log.mcap", controller))
     for tick in range(1700 + round(SECONDS * RATE) + 1):
         session.tick(tick / RATE, missed=False)
+        robot.faults.lost = 0.05 * (tick > 5)
         if tick in (5, 1700):
             assert controller.request(Mode.STAND if tick == 5 else Mode.POLICY) == ""
             before = robot.data.qpos[:7].copy()
@@ -66,7 +69,9 @@ def test_hanging_robot(exported, policy, tmp_path):
     assert (controller.mode, session.stops, robot.excess) == (Mode.POLICY, [], 0.0)
     np.testing.assert_allclose(robot.data.qpos[:7], before, atol=0.01)
     measured = read_recording(RecordedLog(tmp_path / "log.mcap")).measured
-    assert len(measured) == SECONDS * RATE and (np.ptp(measured[:, 0], axis=0) > 0.3).all()
+    moved = np.nanmax(measured[:, 0], axis=0) - np.nanmin(measured[:, 0], axis=0)
+    assert len(measured) == SECONDS * RATE and (moved > 0.3).all()
+    assert np.isnan(measured[:, 0, 0]).mean() == pytest.approx(0.05, abs=0.02)
     status, said, _ = run_here("replay.py", "log.mcap", f"--policy={exported}", root=tmp_path)
     assert status == 0 and said.count("never; 0.0000") == 12 and "bit by bit" not in said
     sweeps.description["task"] = "a1_position"
@@ -75,13 +80,20 @@ def test_hanging_robot(exported, policy, tmp_path):
     assert_told_in_one_line(refused, "the log is of the task 'a1_position', the policy of 'go2_torque_multihead'")
 
 
+class Terminal(io.StringIO):
+    """What somebody types."""
+
+    def isatty(self):
+        return True
+
+
 def test_refused(policy, monkeypatch):
     """Nobody who can say that the robot hangs, another answer, and a policy without gains."""
     assert "needs a terminal" in error_of(chirp.confirm)
-    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
-    monkeypatch.setattr("builtins.input", lambda prompt: "it stands")
-    assert "robots that hang" in error_of(chirp.confirm)
-    monkeypatch.setattr("builtins.input", lambda prompt: "it hangs")
+    for answer in ("it stands\n", ""):  # the end, as of Ctrl-D
+        monkeypatch.setattr("sys.stdin", Terminal(answer))
+        assert "robots that hang" in error_of(chirp.confirm)
+    monkeypatch.setattr("sys.stdin", Terminal("it hangs\n"))
     chirp.confirm()
     monkeypatch.setattr(policy, "stiffness", 0.0 * policy.stiffness)
     assert "stiffness above 0" in error_of(chirp.Chirp, policy, RATE, SECONDS)

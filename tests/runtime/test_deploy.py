@@ -211,8 +211,14 @@ class Older(Mine):
         super().__init__()
         del self.torque_limits
 
-class Unlimited(Mine):
-    torque_limits = property(lambda self: None, lambda self, limits: None)
+class Numbered(Mine):
+    joint_order = property(lambda self: list(range(12)), lambda self, names: None)
+
+class Written(Mine):
+    torque_limits = property(lambda self: ["23.7"] * 12, lambda self, limits: None)
+
+class Short(Mine):
+    torque_limits = property(lambda self: (23.7,) * 11, lambda self, limits: None)
 
 class Addressed(Mine):
     def __init__(self, address):
@@ -236,7 +242,9 @@ def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
     (tmp_path / "queue.py").write_text(OWN)
     named, other = "takes a Python file with the name of a module", "there is another module 'queue'"
     wrong = {"own_robot.py:Yours": "no class 'Yours'", "no_robot.py:Mine": named, "queue.py:Mine": other}
-    wrong |= dict.fromkeys(("own_robot.py:Older", "own_robot.py:Unlimited"), "and as many torque_limits")
+    kinds = "must have joint_order, names, and torque_limits, numbers"
+    wrong |= dict.fromkeys((f"own_robot.py:{name}" for name in ("Older", "Numbered", "Written")), kinds)
+    wrong |= {"own_robot.py:Short": "as many torque_limits as joints"}
     wrong |= {"own_robot.py:Addressed": "made without arguments"}
     for given, message in wrong.items():
         assert_told_in_one_line(run_here(*own[:2], f"--interface={given}", root=tmp_path), message)
@@ -298,6 +306,7 @@ def test_scripts(make_task, exported, tmp_path):
         (["replay.py", "none.mcap", "--policy=none", "--plot=/dev/null/a.png"], "cannot write '/dev/null/a.png'"),
         (["identify.py", "."], "cannot read '.': there is no such file"),
         (["identify.py", "log.mcap", "--out=m.txt"], "--out must end in .yaml or .yml"),
+        (["identify.py", "log.mcap"], "'log.mcap' is no log of deploy.py --chirp"),
     ):
         assert_told_in_one_line(run_here(*words, root=tmp_path), message)
     export_random(make_task, "a1_torque", tmp_path / "a1", **{"control.decimation": 1})  # at 200 Hz
