@@ -10,11 +10,9 @@ It is play.py --policy ... --viewer web, on kinds of rough ground that the polic
 import argparse
 import runpy
 import sys
-from typing import Annotated
 
 from legged_torque import SCRIPTS_DIR
 from legged_torque.utils import cli
-from legged_torque.utils.limits import Limits
 
 POLICY = "go2/rough_torque_multihead"
 KINDS = ["stairs_up", "stairs_down", "rough_slope", "discrete_obstacles", "waves"]
@@ -26,10 +24,9 @@ def main() -> None:
     parser = cli.Parser(__doc__)
     parser.add_argument("policy", nargs="?", default=POLICY, help="robot/approach; default: %(default)s")
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; default: %(default)s")
-    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
+    parser.add_argument("--port", default=8080, help="port of the page, or the next free one; default: 8080")
     parser.add_argument("--device", default="auto", help=argparse.SUPPRESS)  # of the page before, if it has chosen this
     args = parser.parse_args()
-    cli.check_args(args, port=Annotated[int, Limits(1, 65535)])
     ground = ROUGH if "rough" in args.policy else []
     words = [f"--policy={args.policy}", "--viewer=web", "--num_envs=1", f"--host={args.host}", f"--port={args.port}"]
     sys.argv[1:] = [*words, *cli.option_words(args, "device"), *ground, "--command", "0.5", "0", "0"]

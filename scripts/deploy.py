@@ -187,11 +187,10 @@ def outside(args: argparse.Namespace, trained: str) -> Any:
                 raise
             raise UserError(f"'{args.interface}' must be a class that is made without arguments: {error}") from None
         joints, limits = (getattr(transport, name, None) for name in ("joint_order", "torque_limits"))
-        for part, kind in ((joints, str), (limits, Real)):
-            if not (isinstance(part, Collection) and all(isinstance(each, kind) for each in part)):
-                raise UserError(f"'{args.interface}' must have joint_order, names, and torque_limits, numbers")
-        if len(joints) != len(limits):
-            raise UserError(f"'{args.interface}' must have as many torque_limits as joints")
+        both = ((joints, str), (limits, Real))
+        fits = all(isinstance(part, Collection) and all(isinstance(each, kind) for each in part) for part, kind in both)
+        if not fits or len(joints) != len(limits):
+            raise UserError(f"'{args.interface}' must have joint_order, names, and as many torque_limits, numbers")
         return transport
     if args.interface == "sdk":
         from legged_torque.runtime.legged_sdk import LeggedSdkRobot

@@ -46,7 +46,6 @@ def main() -> None:
     with cli.slow_imports():
         matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
-    cli.check_output(out / SETTINGS_FILE)
     launcher = make_launcher(args)
     if args.dry_run:
         check_same(matrix, out)
@@ -56,6 +55,7 @@ def main() -> None:
             except UserError as error:  # with which this cell would fail, and no other
                 print(f"{cell.name}: {error}")
         return
+    cli.check_output(out / SETTINGS_FILE)
     with multi_process_service() if args.mps else contextlib.nullcontext({}) as variables:
         if isinstance(launcher, LocalLauncher):
             launcher.variables |= variables

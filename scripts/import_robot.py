@@ -45,7 +45,7 @@ def main() -> None:
 
         from legged_torque.importer.mjcf import mjcf
         from legged_torque.importer.robot import check, import_robot
-        from legged_torque.importer.settings import settings
+        from legged_torque.importer.settings import IMPORTED, settings
         from legged_torque.sim.fused.tree import read_tree
     robot = import_robot(args.file, args.name, args.torque_limit)
     clone = Path(package).resolve().parents[1]
@@ -53,6 +53,8 @@ def main() -> None:
     folder = RESOURCES_DIR / "robots" / robot.name if is_inside else args.out or Path()
     model_file = folder / f"{robot.name}.xml"
     code_file = (clone / "legged_torque" / "envs" / "robots" if is_inside else folder) / f"{robot.name}.py"
+    if is_inside and code_file.exists() and IMPORTED not in code_file.read_text("utf-8"):
+        raise UserError(f"the robot '{robot.name}' was not imported, and stays as it is; see --name")
     for file in (model_file, code_file):
         cli.check_output(file)
         if file.exists() and file.samefile(args.file):

@@ -58,6 +58,8 @@ def main() -> None:
     with cli.slow_imports():
         run = task_registry.load_run(options) if args.agent == "policy" else None
         env_cfg, train_cfg = (run.env_cfg, run.train_cfg) if run else task_registry.get_cfgs(options.task, options)
+    if args.grid > env_cfg.env.num_envs:
+        raise UserError(f"--grid {args.grid} needs as many worlds, not {env_cfg.env.num_envs}")
     env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands
     if kinds:
         select_tiles(env_cfg.terrain, kinds, levels, 1)
@@ -126,8 +128,6 @@ def check_combinations(args: argparse.Namespace) -> None:
     for option in ("grid", "video", "steps"):
         if getattr(args, option) and has_viewer:
             raise UserError(f"--{option} is not for --viewer {args.viewer}, which shows robots live")
-    if args.grid and args.num_envs is not None and 1 <= args.num_envs < args.grid:
-        raise UserError(f"--grid {args.grid} needs as many worlds, but --num_envs is {args.num_envs}")
     if args.agent != "policy" and (args.load_run or args.policy or args.checkpoint is not None or has_viewer):
         others = "--load_run, --policy, --checkpoint and --viewer"
         raise UserError(f"--agent {args.agent} has no run: {others} are for policies")

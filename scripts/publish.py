@@ -100,7 +100,7 @@ def main() -> None:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     recorder.save(args.out / VIDEO, no_renderer)
-    print(f"Look at it: python -m http.server -d {args.out}")
+    print(f"Look at it: python -m http.server -d {shlex.quote(str(args.out))}")
     if args.push:
         print(f"Uploaded to {upload(args.out, args.push)}")
 

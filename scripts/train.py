@@ -237,14 +237,16 @@ def announce(runner: OnPolicyRunner, options: Options, env_cfg: Any, train_cfg: 
     place = device_name(device) if num_processes == 1 else f"{num_processes} x {device_name(device)}"
     worlds = counted(num_processes * runner.env.num_envs, "world")
     print(f"Training {options.task} on {place}: {worlds}, {counted(total, 'iteration')}.")
-    print(f"Curves: tensorboard --logdir {runner.log_dir}")
+    print(f"Curves: {shlex.join(['tensorboard', '--logdir', runner.log_dir])}")
     how = page or f"{cli.script_command('play')} {run_words(options, runner.log_dir)} --viewer web"
     print(f"See it learn: {how}", flush=True)
 
 
 def run_words(options: Options, run_dir: str) -> str:
-    """Return the options with which other scripts find a run, short enough for a line of a terminal."""
-    return shlex.join([*cli.option_words(options, "task_file", "log_root"), f"--load_run={Path(run_dir).name}"])
+    """Return the options with which other scripts find a run, short enough for a line of a terminal if they can be."""
+    run, words = Path(run_dir), cli.option_words(options, "task_file", "log_root")
+    is_alone = len([*run.parents[1].glob(f"*/{run.name}")]) == 1
+    return shlex.join([*words, f"--load_run={run.name if is_alone else run}"])
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ class Recording:
 
 
 def read_recording(log: Any) -> Recording:
-    """Return the longest part of a :class:`~legged_torque.runtime.log.RecordedLog` in which a chirp acts.
+    """Return the longest part of a :class:`~legged_torque.runtime.log.RecordedLog` in which a policy or a chirp acts.
 
     A tick is where it was due, and repeats the one before if it was late by more than half a period. A UserError if
     that part is too short, begins without a state, or the trunk moves.
@@ -42,7 +42,7 @@ def read_recording(log: Any) -> Recording:
     parts = [list(ticks) for mode, ticks in groupby(log.ticks(), lambda tick: tick[3]["mode"]) if mode == "policy"]
     ticks = max(parts, key=len, default=[])
     if len(ticks) * log.period < SHORTEST:
-        raise UserError(f"the log has {len(ticks) * log.period:.1f} s of a chirp; {SHORTEST:g} s are needed")
+        raise UserError(f"the log has {len(ticks) * log.period:.1f} s of a policy or chirp; {SHORTEST:g} s are needed")
     times, states, sent, _ = zip(*ticks, strict=True)
     times = times if log.keeps_time else log.period * np.arange(len(ticks))  # such a robot waits for late ticks
     if states[0] is None:

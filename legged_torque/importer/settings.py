@@ -14,7 +14,8 @@ SCALED_HEIGHT = 0.28  # trunk height for which that holds; larger robots with fo
 ACTION_SCALE = (0.25, 0.15)  # without and with two legs, whose gains are higher than the G1's [rad]
 LINE = 90  # most characters of a literal in one line
 
-TEMPLATE = '''"""{title}: imported settings; each number is a proposal to look at."""
+IMPORTED = "imported settings; each number is a proposal to look at."  # at the end of a module's docstring
+TEMPLATE = '''"""{title}: {imported}"""
 
 # Source: {file}
 
@@ -93,6 +94,7 @@ def settings(robot: Robot, path: str = "", is_fused: bool = True) -> str:
     relative = 1.0 if two_legs else SCALED_HEIGHT / stance.height
     return TEMPLATE.format(
         title=robot.name,
+        imported=IMPORTED,
         file=ascii(robot.source.file.name),
         imports=(IMPORTS if path else OWN_IMPORTS) + (G1 if two_legs else ""),
         base="G1Cfg" if two_legs else "LeggedRobotCfg",

@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import os
 import re
+import shlex
 import shutil
 import signal
 import sys
@@ -46,7 +47,7 @@ def script_command(script: str) -> str:
     if SCRIPTS_DIR.parent == Path(__file__).resolve().parents[1]:
         return f"python -m legged_torque.scripts.{script}"
     file = SCRIPTS_DIR / f"{script}.py"
-    return f"python {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}"
+    return f"python {shlex.quote(str(file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file))}"
 
 
 class Parser(argparse.ArgumentParser):

@@ -161,9 +161,10 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
     writer.close()
 
 
-def gif_durations(count: int, step: float) -> list[int]:
-    """Return how long frames are shown [ms] that come every ``step`` [s]; a gif counts hundredths of seconds."""
-    return (10 * np.diff(np.round(100.0 * step * np.arange(count + 1)))).astype(int).tolist()
+def gif_durations(count: int, step: float) -> list[int] | int:
+    """Return how long frames are shown [ms] that come every ``step`` [s]: hundredths of seconds, a number for one."""
+    durations = (10 * np.diff(np.round(100.0 * step * np.arange(count + 1)))).astype(int).tolist()
+    return durations if count > 1 else durations[0]
 
 
 def velocity_rows(time: float, command: np.ndarray, velocity: np.ndarray) -> list[Row]:

@@ -267,7 +267,7 @@ def test_groups_in_the_scripts(tmp_path, monkeypatch):
         actor = f"--set=obs_groups.actor={groups}"
         status, said, _ = run_here("train.py", *words, actor, "--max_iterations=1", "--logger=none", root=tmp_path)
         assert status == 0 and ("Note: exports of this policy" in said) == (groups == "[lean]")
-        results.append(run_here("export.py", *words, actor, f"--out={groups}", root=tmp_path))
+        results.append(run_here("export.py", *words[:3], f"--out={groups}", root=tmp_path))
     assert results[0][1].endswith("'[policy,lean]' --task_file=lean_robot.py\n")
     assert_told_in_one_line(results[1], "must be 'policy', then groups of single terms (lean), not lean")
     simulation = ["sim2sim.py", "[policy,lean]", "--robots=1", "--steps=3"]
@@ -362,7 +362,7 @@ def test_script(tmp_path):
     assert run_here("train.py", *SMALL, root=tmp_path)[0] == 0
     (run,) = (tmp_path / "logs" / "a1_position").iterdir()
     words = ["--task=a1_position", "--device=cpu"]
-    result = run_here("export.py", *words, "--set=actor.hidden_dims=[8]", root=tmp_path)
+    result = run_here("export.py", *words, "--set=env.history_length=2", root=tmp_path)
     assert_told_in_one_line(result, "does not fit this task")
     assert_told_in_one_line(run_here("export.py", *words, "--checkpoint=9", root=tmp_path), "unknown checkpoint '9'")
     assert not list(run.glob("exported*"))

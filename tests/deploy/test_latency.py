@@ -10,10 +10,9 @@ from support.scripts import run_here
 from support.settings import error_of
 
 from legged_torque.deploy.description import read
-from legged_torque.deploy.latency import Latency
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
-from legged_torque.deploy.simulation import Simulation
+from legged_torque.deploy.simulation import Latency, Simulation
 from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot, task_registry
 from legged_torque.motors.config import DelayCfg
 

@@ -81,6 +81,14 @@ def test_script(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("hen.*"))
 
 
+def test_robots_of_the_library(tmp_path, monkeypatch):
+    """Those that nobody has imported are not written over."""
+    monkeypatch.setattr("legged_torque.utils.files.write_whole", lambda *file: pytest.fail("something was written"))
+    (tmp_path / "go2.urdf").write_text(urdf())
+    refused = run_here("import_robot.py", str(tmp_path / "go2.urdf"), "--force", root=ROOT)
+    assert_told_in_one_line(refused, "the robot 'go2' was not imported, and stays as it is; see --name")
+
+
 def test_robots_of_the_clone(tmp_path, monkeypatch, capsys):
     """Modules in envs/robots are robots, others and helpers beside them are none, nor are two robots in one."""
     (tmp_path / "dog.urdf").write_text(urdf())

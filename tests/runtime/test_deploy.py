@@ -242,9 +242,8 @@ def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
     (tmp_path / "queue.py").write_text(OWN)
     named, other = "takes a Python file with the name of a module", "there is another module 'queue'"
     wrong = {"own_robot.py:Yours": "no class 'Yours'", "no_robot.py:Mine": named, "queue.py:Mine": other}
-    kinds = "must have joint_order, names, and torque_limits, numbers"
-    wrong |= dict.fromkeys((f"own_robot.py:{name}" for name in ("Older", "Numbered", "Written")), kinds)
-    wrong |= {"own_robot.py:Short": "as many torque_limits as joints"}
+    kinds = "must have joint_order, names, and as many torque_limits, numbers"
+    wrong |= dict.fromkeys((f"own_robot.py:{name}" for name in ("Older", "Numbered", "Written", "Short")), kinds)
     wrong |= {"own_robot.py:Addressed": "made without arguments"}
     for given, message in wrong.items():
         assert_told_in_one_line(run_here(*own[:2], f"--interface={given}", root=tmp_path), message)

@@ -1,6 +1,7 @@
 """Without a task, scripts take the last run of all tasks, or the task of the run that is named."""
 
 import re
+import runpy
 import shlex
 import shutil
 
@@ -8,6 +9,7 @@ import pytest
 from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
 from support.strangers import LOADING
 
+from legged_torque.utils.options import Options
 from legged_torque.utils.policies import POLICIES_DIR
 
 FIRST, LAST = "2026-01-01_00-00-00", "2026-01-02_00-00-00"
@@ -38,10 +40,13 @@ def test_last_run_of_all_tasks(script, logs):
 
 
 def test_one_name_of_two_runs(logs):
-    """Which one is meant is asked for."""
+    """Which one is meant is asked for, and trainings that begin in the same second print paths."""
+    run, run_words = logs / "a1_position" / FIRST, runpy.run_path(f"{ROOT}/scripts/train.py")["run_words"]
+    assert run_words(Options(), str(run)) == f"--load_run={FIRST}"
     shutil.copytree(logs / "a1_torque" / LAST, logs / "a1_torque" / FIRST)
     told = f"logs/a1_position/{FIRST}, logs/a1_torque/{FIRST}"
     assert_told_in_one_line(run_here("evaluate.py", f"--load_run={FIRST}", root=logs.parent), told)
+    assert run_words(Options(), str(run)) == f"--load_run={run}"
 
 
 def test_two_rates_are_not_compared(logs):

@@ -75,6 +75,10 @@ def test_command_of_other_scripts(monkeypatch, tmp_path):
     for folder, words in {ROOT: "python scripts/play.py", tmp_path: f"python {ROOT}/scripts/play.py"}.items():
         monkeypatch.chdir(folder)
         assert script_command("play") == words
+    with monkeypatch.context() as moved:
+        moved.setattr("legged_torque.utils.cli.SCRIPTS_DIR", ROOT / "my scripts")
+        moved.setattr("legged_torque.utils.cli.__file__", str(tmp_path / "a" / "b" / "cli.py"))
+        assert script_command("play") == f"python '{ROOT}/my scripts/play.py'"
     monkeypatch.setattr("legged_torque.utils.cli.SCRIPTS_DIR", ROOT / "legged_torque" / "scripts")
     monkeypatch.setattr(sys, "argv", ["train.py"])
     assert script_command("play") == "python -m legged_torque.scripts.play"
@@ -118,7 +122,7 @@ def test_agents(tmp_path):
 @pytest.mark.parametrize(
     ("reason", "status", "line"),
     [
-        (ModuleNotFoundError(name="nothing"), "2", "error: 'nothing' is not installed; pip"),
+        (ModuleNotFoundError(name="nothing"), "2", "error: 'nothing' is not installed"),
         (KeyboardInterrupt(), "130", "interrupted"),
     ],
 )

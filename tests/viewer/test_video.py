@@ -38,11 +38,13 @@ for robots, rate, ending in ((1, 75.0, "gif"), (4, 25.0, "mp4")):
     recorder.steps = 5 * [[np.tile(qpos, (robots, 1)), np.ones((robots, 3)), np.zeros((robots, 3))]]
     recorder.write(Path(sys.argv[2]) / f"{robots}.{ending}", None, lambda *frame: frames.append(frame))
     assert frames == [(1, 3), (2, 3), (3, 3)], frames
+recorder.steps = 2 * [[row[:1] for row in recorder.steps[0]]]
+recorder.write(Path(sys.argv[2]) / "2.gif", None)
 """
 
 
 def test_frames(tmp_path):
-    """A video has every second step in real time; its size is that of all tiles, which all show a robot."""
+    """A video has every second step in real time, maybe one; its size is that of all tiles, which all show a robot."""
     for package in ("imageio", "imageio_ffmpeg"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install -e .[video]")
     import imageio
@@ -67,6 +69,8 @@ def test_frames(tmp_path):
     with Image.open(file.with_name("1.gif")) as picture:
         durations = [(picture.seek(i), picture.info["duration"])[1] for i in range(picture.n_frames)]
     assert durations == [30, 20, 30]  # [ms]: a gif counts hundredths of seconds
+    with Image.open(file.with_name("2.gif")) as picture:
+        assert (picture.n_frames, picture.size) == (1, (960, 540))
 
 
 def test_recorded_worlds(make_task):
