@@ -162,7 +162,7 @@ def show_in_tensorboard(video: Path, iterations: int) -> None:
 
 
 def gif_durations(count: int, step: float) -> list[int] | int:
-    """Return how long frames are shown [ms] that come every ``step`` [s]: hundredths of seconds, a number for one."""
+    """Return how long frames are shown [ms] that come every ``step`` [s], in whole 10 ms; a number for a single one."""
     durations = (10 * np.diff(np.round(100.0 * step * np.arange(count + 1)))).astype(int).tolist()
     return durations if count > 1 else durations[0]
 

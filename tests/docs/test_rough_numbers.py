@@ -174,4 +174,5 @@ def test_rough_ground_without_damping():
     before = before.sort_values("steps").groupby("task")["track_percentage"].last()
     failed, pd_control = before.filter(regex="^(a1|go).*multihead"), before.filter(regex="^(a1|go).*position")
     assert f"ended at {failed.min():.2f} to {failed.max():.2f}, PD at {pd_control.min():.2f}" in text
-    assert f"to {pd_control.max():.2f}, ANYmal C's PD at {before['anymal_c_rough_position']:.2f} (" in text
+    anymal = " and ".join(f"{before[f'anymal_c_rough_{each}']:.2f}" for each in ("torque_multihead", "position"))
+    assert f"to {pd_control.max():.2f}, ANYmal C's at {anymal} (" in text
