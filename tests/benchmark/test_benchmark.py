@@ -8,8 +8,8 @@ import signal
 
 import pytest
 import torch
-from support.runners import build_runner
 from support.scripts import run_here
+from support.settings import build_runner
 
 from legged_torque.benchmark import measure as benchmark
 from legged_torque.envs import LeggedRobot, task_registry

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 import torch
 import warp
-from support.command import command
 from support.pages import fences, make, python_files, train
-from support.scripts import run_here
+from support.scripts import command, run_here
 from support.settings import parse
 
 from legged_torque.envs import task_registry

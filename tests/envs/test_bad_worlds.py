@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.runners import build_runner
 from support.scripts import run_here
+from support.settings import build_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry

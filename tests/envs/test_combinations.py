@@ -6,10 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.control import CONVERGED, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
-from support.episodes import HIGH_UP, time_out
+from support.control import CONVERGED, HIGH_UP, NOMINAL, TORQUE_LIMIT, mirror_policy, pd_by_hand, random_state, time_out
 from support.settings import error_of, get_cfgs, torques_in_torch
-from support.symmetry import mirror_policy
 
 from legged_torque.envs import A1TorqueCfg
 from legged_torque.envs.approaches.torque import TorqueRobot

@@ -4,8 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.control import CONVERGED, IN_THE_AIR, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state
-from support.episodes import time_out
+from support.control import CONVERGED, IN_THE_AIR, NOMINAL, TORQUE_LIMIT, pd_by_hand, random_state, time_out
 from support.settings import error_of
 
 

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from support.control import CONVERGED, pd_by_hand
+from support.control import CONVERGED, WEIGHT, contacts_by_hand, pd_by_hand
 from support.settings import torques_in_torch
-from support.simulator import WEIGHT, contacts_by_hand
 
 from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, measure
 from legged_torque.utils.metrics import UNITS, estimate, step_sums

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.control import JOINTS
+from support.control import JOINTS, LEGS, SENSED
 from support.settings import TASKS
-from support.simulator import LEGS, SENSED
 
 TABLES = yaml.safe_load(Path(__file__).with_name("rewards.yaml").read_text("utf-8"))
 TABLE_III = TABLES["weights"]

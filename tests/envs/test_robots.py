@@ -9,8 +9,8 @@ import pytest
 import torch
 import warp
 import yaml
+from support.control import LEGS, SENSED
 from support.settings import error_of, torques_in_torch
-from support.simulator import LEGS, SENSED
 
 from legged_torque import resource_path
 from legged_torque.envs import task_registry

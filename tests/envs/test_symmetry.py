@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from support.runners import build_runner
-from support.settings import get_cfgs
-from support.symmetry import mirror_joints, mirror_policy
+from support.control import mirror_joints, mirror_policy
+from support.settings import build_runner, get_cfgs
 from tensordict import TensorDict
 from torch import nn
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from support.capture import differences, gradient_errors, recorded
+from support.on_device import differences, gradient_errors, recorded
 
 from legged_torque.utils.task_registry import set_seed
 

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from support.capture import gradient_errors
+from support.on_device import gradient_errors
 from support.rollouts import record_rollout
 from support.wide_ppo import MIRROR, STEPS, assert_steps_are_those_of_torch, build, choose, mirrored
 from tensordict import TensorDict

@@ -1,9 +1,8 @@
 """Rough ground: the fused step on height maps against plain MuJoCo, and a training with and without CUDA graphs."""
 
-from support.capture import differences
 from support.fused import step_mujoco
 from support.maps import assert_feet_meet_planes, states_on_slope
-from support.on_device import assert_matches, make_robot, make_sim, step
+from support.on_device import assert_matches, differences, make_robot, make_sim, step
 
 WORDS = ["--task=a1_rough_torque_multihead_scan", "--num_envs=512", "--perturbation=low", "--set=evaluation.interval=0"]
 WORDS += ["--set=terrain.num_rows=3", "--set=terrain.max_init_terrain_level=2", "--set=runner.num_steps_per_env=8"]

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from rsl_rl.models import MLPModel
+from support.control import mirror_joints, mirror_policy
 from support.rollouts import parameters, record_rollout
-from support.runners import build_runner
-from support.symmetry import mirror_joints, mirror_policy
+from support.settings import build_runner
 from support.wide_ppo import MIRROR, Mirrored, build, choose, mirrored
 from tensordict import TensorDict
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from support.evaluations import COLUMNS, note_steps, read_rows
-from support.runners import build_runner
-from support.settings import error_of, get, get_cfgs
+from support.settings import build_runner, error_of, get, get_cfgs
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.learning.evaluator import TrainingEvaluator, append_row

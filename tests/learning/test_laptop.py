@@ -12,8 +12,8 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
-from support.runners import build_runner
 from support.scripts import COMMAND, PATHS, assert_told_in_one_line, run_here
+from support.settings import build_runner
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.curriculum import LinearCurriculum

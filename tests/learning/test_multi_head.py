@@ -5,8 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from support.runners import build_runner
-from support.settings import error_of
+from support.settings import build_runner, error_of
 from tensordict import TensorDict
 
 from legged_torque.learning.multi_head import MultiHeadMLP, MultiHeadModel

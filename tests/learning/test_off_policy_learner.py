@@ -5,8 +5,7 @@ import copy
 import torch
 from rsl_rl.modules import MLP
 from support.point_masses import PointMasses, assert_holds_points, make_trainer
-from support.runners import build_runner
-from support.settings import error_of
+from support.settings import build_runner, error_of
 
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from support.runners import build_runner, networks
-from support.settings import COMBINATIONS, TASKS, error_of
+from support.settings import COMBINATIONS, TASKS, build_runner, error_of, networks
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 WORLDS, STEPS = 4, 4

@@ -8,7 +8,7 @@ import os
 import pytest
 import torch
 from support.rollouts import POISONS, SIZES, make_ppo, parameters, poison, record_rollout, steps_taken
-from support.runners import build_runner, networks
+from support.settings import build_runner, networks
 from support.wide_ppo import NARROW, assert_steps_are_those_of_torch, build, choose
 
 from legged_torque.learning.ppo import LOSS_NAMES, OnDevicePPO, has_kernels

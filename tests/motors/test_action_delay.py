@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support.control import pd_by_hand
-from support.episodes import HIGH_UP, time_out
+from support.control import HIGH_UP, pd_by_hand, time_out
 from support.settings import error_of, torques_in_torch
 
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}

@@ -8,8 +8,7 @@ import pytest
 import torch
 import warp as wp
 import yaml
-from support.control import NOMINAL, pd_by_hand
-from support.episodes import HIGH_UP
+from support.control import HIGH_UP, NOMINAL, pd_by_hand
 from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs import task_registry

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.control import NOMINAL, pd_by_hand
-from support.episodes import HIGH_UP, time_out
+from support.control import HIGH_UP, NOMINAL, pd_by_hand, time_out
 from support.settings import error_of
 
 from legged_torque.envs import task_registry

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from support.episodes import HIGH_UP, time_out
+from support.control import HIGH_UP, time_out
 from support.settings import error_of, torques_in_torch
 
 from legged_torque.envs.approaches.torque import TorqueRobot

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from support.control import REAL_MOTORS, TORQUE_LIMIT, pd_by_hand
-from support.episodes import HIGH_UP, time_out
+from support.control import HIGH_UP, REAL_MOTORS, TORQUE_LIMIT, pd_by_hand, time_out
 from support.settings import torques_in_torch
 
 from legged_torque.envs.base.legged_robot import IN_TORCH, LeggedRobot

@@ -4,9 +4,9 @@ import itertools
 
 import pytest
 import torch
+from support.control import mirror_joints, mirror_policy
 from support.gravity import FEW, STD, TASK, words_of
 from support.settings import error_of, get_cfgs, parse
-from support.symmetry import mirror_joints, mirror_policy
 from tensordict import TensorDict
 
 from legged_torque.envs import task_registry

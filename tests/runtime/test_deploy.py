@@ -10,9 +10,8 @@ import time
 
 import numpy as np
 import pytest
-from support.command import command
 from support.exports import export_random
-from support.scripts import ROOT, assert_told_in_one_line, run_here
+from support.scripts import ROOT, assert_told_in_one_line, command, run_here
 
 pytest.importorskip("cyclonedds", reason="needs the extra: pip install 'legged_torque[robot]'")
 

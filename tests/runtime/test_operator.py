@@ -10,10 +10,9 @@ import time
 
 import pytest
 from rich.console import Console
-from support.scripts import ROOT
+from support.scripts import ROOT, in_a_terminal
 from support.settings import error_of
 from support.simulated import standing_at_once
-from support.terminal import in_a_terminal
 
 from legged_torque.runtime import operator
 from legged_torque.runtime.controller import Mode

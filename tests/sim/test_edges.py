@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.control import SENSED
 from support.fused import compiled, make_a1
 from support.maps import Map, ball, heights_under, make_map, simulate
-from support.simulator import SENSED
 
 from legged_torque.sim.registry import make_engine
 from legged_torque.terrain.height_grid import HeightGrid

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from support.control import LEGS, SENSED
 from support.engine_suite import LEG_UP, EngineSuite
 from support.fused import compiled, make_a1
-from support.simulator import LEGS, SENSED
 
 from legged_torque.sim import mjwarp
 from legged_torque.sim.registry import make_engine

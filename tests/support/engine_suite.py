@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.control import LEGS, SENSED, WEIGHT, contacts_by_hand
 from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random, step_mujoco
-from support.simulator import LEGS, SENSED, WEIGHT, contacts_by_hand
 
 from legged_torque.sim.engine import CAPABILITIES
 from legged_torque.sim.registry import ENGINES, make_engine

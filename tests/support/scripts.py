@@ -1,12 +1,17 @@
-"""Scripts in this process and in one of their own."""
+"""Scripts in this process, in one of their own and in a terminal; the console command and its completions."""
 
 import contextlib
+import fcntl
 import io
 import json
 import os
+import pty
 import runpy
+import signal
+import struct
 import subprocess
 import sys
+import termios
 from pathlib import Path
 
 import pytest
@@ -69,3 +74,53 @@ def assert_light(answers, root):
     for (words, expected), (status, *imported) in zip(answers.items(), results, strict=True):
         assert (status, HEAVY & set(imported)) == (expected, set()), words
         assert "legged_torque" in imported
+
+
+CODE = "import sys; sys.argv[0] = '/bin/legged-torque'; from legged_torque.utils.command import main; "
+
+
+def command(*words, env=None):
+    """Run ``legged-torque`` in a process of its own; its status, standard output and standard error."""
+    code = f"{CODE}\ntry: main()\nfinally: print({HEAVY | {'argcomplete'}} & set(sys.modules) or '', end='')"
+    variables = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *sys.path[1:]])} | (env or {})
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, env=variables)
+    return done.returncode, done.stdout, done.stderr
+
+
+def complete(line, file):
+    """Words that a shell offers after a line; the command writes them to a file."""
+    pytest.importorskip("argcomplete")
+    variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+    variables |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(file), "_ARGCOMPLETE_SHELL": "bash"}
+    status, _, error = command(env=variables)
+    assert status == 0, error
+    return file.read_text().split()
+
+
+def in_a_terminal(code, columns=80, rows=40, after="", close=False, **variables):
+    """Run code in a terminal; once ``after`` has come, press Ctrl-C or close it. Return exit status and output."""
+    master, slave = pty.openpty()
+    fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+    environment = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "NO_COLOR", "LINES")}
+    environment |= {"PYTHONPATH": str(ROOT), "TERM": "xterm-256color", "PYTHONUTF8": "1", **variables}
+    streams = {"stdin": slave, "stdout": slave, "stderr": slave}
+
+    def take_terminal():
+        """Make it the controlling one, and notice when it closes, also in tests that run under nohup."""
+        fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+    how = {"env": environment, "start_new_session": True, "preexec_fn": take_terminal}
+    process = subprocess.Popen([sys.executable, "-c", code], **streams, **how)
+    os.close(slave)
+    output = b""
+    with contextlib.suppress(OSError):  # at the end of a terminal
+        while data := os.read(master, 65536):
+            output += data
+            if after and after in output.decode(errors="replace"):
+                if close:
+                    break
+                process.send_signal(signal.SIGINT)
+                after = ""
+    os.close(master)
+    return process.wait(120), output.decode()

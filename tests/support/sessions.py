@@ -1,8 +1,10 @@
-"""Live sessions of policies that have not been trained."""
+"""Live sessions of policies that have not been trained, and tilted trunks."""
 
 import contextlib
 import threading
 
+import mujoco
+import numpy as np
 import torch
 from support.ground import ground_cfg
 
@@ -50,3 +52,12 @@ def running(session):
     yield session
     session.stop()
     thread.join(timeout=120)
+
+
+def tilted(yaw, angle=1.0):
+    """The quaternion of a trunk that is turned about the vertical, then tilted about a horizontal axis [rad]."""
+    turn, tilt, result = np.zeros(4), np.zeros(4), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(turn, [0.0, 0.0, 1.0], yaw)
+    mujoco.mju_axisAngle2Quat(tilt, [0.6, 0.8, 0.0], angle)
+    mujoco.mju_mulQuat(result, tilt, turn)
+    return result

@@ -7,8 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 import yaml
-from support.command import command, complete
-from support.scripts import ROOT, assert_told_in_one_line, run_here
+from support.scripts import ROOT, assert_told_in_one_line, command, complete, run_here
 from support.settings import error_of, get_cfgs, parse
 
 from legged_torque.envs import task_registry

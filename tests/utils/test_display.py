@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 from support.clock import Clock
-from support.terminal import in_a_terminal
+from support.scripts import in_a_terminal
 
 from legged_torque.learning.training_display import TrainingDisplay, read_tracking
 from legged_torque.utils.display import REDRAW_EVERY, Counter, read_progress

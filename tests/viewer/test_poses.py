@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from support.tilted import tilted
+from support.sessions import tilted
 
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 

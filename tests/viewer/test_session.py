@@ -9,8 +9,7 @@ import pytest
 import torch
 from rsl_rl.models import RNNModel
 from support.clock import Clock, wait_for
-from support.sessions import new_session
-from support.tilted import tilted
+from support.sessions import new_session, tilted
 
 from legged_torque.learning.memory import acting
 from legged_torque.viewer import session as session_module
