@@ -4,7 +4,7 @@ import importlib
 import sys
 
 import pytest
-from support.pages import python_files
+from support.documents import python_files
 
 from legged_torque.envs import task_registry
 

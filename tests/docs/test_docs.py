@@ -8,14 +8,13 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from support.documents import DOCS, ROOT
 from support.settings import build_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.config import to_dict
 
-ROOT = Path(__file__).resolve().parents[2]
-DOCS = ROOT / "docs"
 OTHERS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "AGENTS.md", "SECURITY.md")]
 PAGES = [*OTHERS, *sorted(DOCS.rglob("*.md"))]
 
@@ -92,7 +91,7 @@ def test_sizes():
     assert sum(file.stat().st_size for file in DOCS.rglob("*") if file.is_file()) <= 3_000_000
 
 
-REFERENCE = Path(__file__).resolve().parents[2] / "docs" / "reference"
+REFERENCE = DOCS / "reference"
 
 
 @pytest.fixture(scope="module")

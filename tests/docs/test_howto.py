@@ -6,13 +6,12 @@ import runpy
 import shlex
 import shutil
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import warp
-from support.pages import fences, make, python_files, train
+from support.documents import ROOT, fences, make, python_files, train
 from support.scripts import command, run_here
 from support.settings import parse
 
@@ -20,7 +19,6 @@ from legged_torque.envs import task_registry
 from legged_torque.utils.cli import Parser
 from legged_torque.utils.options import Options
 
-ROOT = Path(__file__).resolve().parents[2]
 GENERATED = ("docs/reference/", "docs/results/", "docs/index.md", "docs/changelog.md", "docs/contributing.md")
 FILES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md")] + sorted((ROOT / "docs").rglob("*.md"))
 PAGES = [name for name in (str(file.relative_to(ROOT)) for file in FILES) if not name.startswith(GENERATED)]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from rsl_rl.algorithms import PPO
-from support.pages import make, train
+from support.documents import make, train
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.errors import UserError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from support.fused import compiled, draw_states, make_crab, put
-from support.published import read_robot
+from support.robot_files import read_robot
 from support.settings import error_of
 
 from legged_torque.envs.base.state import RobotState

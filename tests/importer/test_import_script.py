@@ -3,7 +3,7 @@
 import functools
 
 import pytest
-from support.published import as_mjcf, urdf
+from support.robot_files import as_mjcf, urdf
 from support.scripts import ROOT, assert_told_in_one_line, run_here
 
 from legged_torque.envs import robots, task_registry, tasks

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from support.published import as_menagerie, as_mjcf, urdf
+from support.robot_files import as_menagerie, as_mjcf, urdf
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.envs import task_registry

@@ -7,7 +7,7 @@ from pathlib import Path
 import mujoco
 import pytest
 import yaml
-from support.motion import check_motion
+from support.robot_files import check_motion
 
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import check, import_robot

@@ -5,7 +5,7 @@ import re
 import mujoco
 import numpy as np
 import pytest
-from support.motion import check_motion
+from support.robot_files import check_motion
 
 from legged_torque.importer.mjcf import mjcf
 from legged_torque.importer.robot import check, import_robot

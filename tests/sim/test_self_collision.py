@@ -7,7 +7,7 @@ import torch
 import warp
 from support.fused import assert_alike, compiled, put, step_fused, step_mujoco
 from support.on_device import assert_matches
-from support.published import read_robot
+from support.robot_files import read_robot
 from support.settings import error_of
 
 from legged_torque.envs.base.asset import load_asset

@@ -1,8 +1,15 @@
-"""Pages and tables of the documents, and the numbers in them."""
+"""Pages and tables of the documents, the numbers in them, and their code with its tasks on the CPU."""
 
+import re
 from pathlib import Path
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
+import torch
+
+from legged_torque.envs import task_registry
+from legged_torque.utils.options import Options
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
 TASKS = {
     "PD": "a1_position",
     "default torque": "a1_torque",
@@ -38,3 +45,39 @@ def iqm(values):
     """Interquartile mean: without a quarter of the values, rounded down, at each end."""
     out = len(values) // 4
     return values.sort_values().iloc[out : len(values) - out].mean()
+
+
+def fences(page):
+    """Each Bash and Python block of a page: line, why it is not run if it is marked so, language, text."""
+    text = (ROOT / page).read_text("utf-8")
+    pattern = r"^(?:<!-- not run: (\S[^\n]*) -->\n)?```(bash|python)\n(.*?)^```"
+    found = re.finditer(pattern, text, flags=re.MULTILINE | re.DOTALL)
+    return [(text.count("\n", 0, match.start(2)) + 1, match[1] or "", match[2], match[3]) for match in found]
+
+
+def python_files(page):
+    """A page's files of Python that are run, a block each: name, given in the first line or made up, and text."""
+    texts = [block for _, mark, language, block in fences(page) if language == "python" and not mark]
+    texts = ["\n".join(texts)] if page == "docs/howto/python.md" else texts  # a program, as it says
+    names = [re.match(r"# (\w+)\.py\n", text) for text in texts]
+    made_up = (f"block_{i}_of_a_page" for i in range(len(texts)))
+    return [(name[1] if name else other, text) for name, other, text in zip(names, made_up, texts, strict=True)]
+
+
+def make(name, *settings, num_envs=4):
+    """Build a task of a page on the CPU."""
+    torch.manual_seed(0)
+    options = Options(device="cpu", num_envs=num_envs, set=list(settings))
+    return task_registry.make_env(name, options)[0]
+
+
+def train(task, name):
+    """Train a task for two short iterations."""
+    settings = ["runner.num_steps_per_env=4", "evaluation.interval=0", "actor.hidden_dims=[16, 16]"]
+    _, train_cfg = task_registry.get_cfgs(name, Options(device="cpu", set=settings))
+    runner, _ = task_registry.make_alg_runner(task, name, train_cfg=train_cfg, log_root=None)
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(2)
+    after = list(runner.alg.actor.parameters())
+    assert all(torch.isfinite(parameter).all() for parameter in after)
+    assert any(not torch.equal(*pair) for pair in zip(before, after, strict=True))

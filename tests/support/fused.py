@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 import torch
-from support.published import read_robot
+from support.robot_files import read_robot
 
 from legged_torque import RESOURCES_DIR
 from legged_torque.sim.model import build_model

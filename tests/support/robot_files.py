@@ -1,12 +1,16 @@
-"""Variants of the A1's file."""
+"""Robots' files: variants of the A1's, and some as others publish them: a URDF, a plain MJCF, one like Menagerie's."""
 
 import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 
+import mujoco
+import numpy as np
 import pytest
 
 from legged_torque import RESOURCES_DIR
 
 A1 = RESOURCES_DIR / "robots/a1/a1.xml"
+ROBOTS = Path(__file__).with_name("robots")
 UNITREE_ORDER = ("FL", "FR", "RL", "RR")
 
 
@@ -80,3 +84,62 @@ def turn_left_hips(root):
     """Left hips turn about an axis that points backwards; their range is symmetric."""
     for leg in ("FL", "RL"):
         joint(f"{leg}_hip_joint", axis="-1 0 0")(root)
+
+
+def urdf():
+    """A quadruped as vendors write them: fixed feet and an IMU, cylinders, a mesh that is not there, transmissions."""
+    return (ROBOTS / "vendor.urdf").read_text()
+
+
+def as_mjcf(text):
+    """A file in which motors are in another order than joints, limits are ctrlrange, one joint has a servo."""
+    return (ROBOTS / "plain.xml").read_text().replace("</mujoco>", f"{text}</mujoco>")
+
+
+def as_menagerie():
+    """A file in the manner of MuJoCo Menagerie.
+
+    It has default classes, visual and collision geoms in groups of their own, visual meshes that are not there, servos
+    in another order than joints, damping for those servos, excluded contacts, a site, sensors, and a keyframe.
+    """
+    return (ROBOTS / "menagerie.xml").read_text()
+
+
+def read_robot(name):
+    """The specification of a robot of the tests."""
+    return mujoco.MjSpec.from_file(str(ROBOTS / f"{name}.xml"))
+
+
+def free_accelerations(model, joints, angles):
+    """Return how torques accelerate the joints of a robot that floats freely: the same in every frame of its trunk."""
+    data, matrix = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    for joint, angle in zip(joints, angles, strict=True):
+        data.joint(joint).qpos = angle
+    mujoco.mj_forward(model, data)
+    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
+    dofs = [model.joint(joint).dofadr[0] for joint in joints]
+    matrix[dofs, dofs] -= model.dof_armature[dofs]  # which the importer may assume
+    return np.linalg.inv(matrix)[np.ix_(dofs, dofs)]
+
+
+def check_motion(text, robot, model):
+    """The imported model moves as MuJoCo's own reading of the source says."""
+    spec = mujoco.MjSpec.from_string(text)
+    for geom in spec.geoms:
+        geom.mass = 0.0 if "<robot" in text else geom.mass
+    (root,) = [body for body in spec.worldbody.bodies if len(body.find_all("joint")) > 1]
+    if not root.joints:
+        root.add_freejoint()
+    spec.compiler.fusestatic = True
+    source = spec.compile()
+    source.dof_armature[:6] = 0.0  # of the free joint, which is left out
+    names = [source.joint(i).name for i in range(1, source.njnt)]
+    random = np.random.default_rng(0)
+    assert model.body_mass.sum() == pytest.approx(source.body_mass.sum(), rel=1e-4)
+    for _ in range(3):
+        angles = random.uniform(-1, 1, len(names))
+        expected, found = (
+            free_accelerations(each, joints, angles) for each, joints in ((source, names), (model, robot.joints))
+        )
+        np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
 
 from support.clock import Clock, wait_for
-from support.published import urdf
+from support.robot_files import urdf
 from support.scripts import run_here
 from support.sessions import new_session, running
 from support.visitor import visitor
