@@ -3,7 +3,6 @@
 from typing import Any
 
 import mujoco
-import torch
 from torch import Tensor
 
 from legged_torque.terrain.height_map import HeightMap
@@ -26,10 +25,6 @@ class Terrain:
         """Put the map, if there is one, into a robot's MJCF in place of its plane, the geom ``floor`` of the world."""
         if self.map:
             self.map.add_to(spec, floor)
-
-    def height(self, points: Tensor) -> Tensor:
-        """Return the height of the ground at x and y of points [m]. Shapes: (..., 3) to (...,)."""
-        return self.map.height(points) if self.map else torch.zeros_like(points[..., 2])
 
     def height_above(self, points: Tensor) -> Tensor:
         """Return how high points are above the ground under them [m]. Shapes: (..., 3), (...,)."""

@@ -79,7 +79,7 @@ class WatchedRobot(LeggedRobot):
         if isinstance(self.terrain, RoughGround):
             tile = int(self.terrain.levels[world]), int(self.terrain.columns[world])
             scan = self._watched_scan.points()[world]
-            scan[:, 2] = self.terrain.height(scan)
+            scan[:, 2] = self.terrain.map.height(scan)
         ratios = self._metrics.ratios()
         names, targets = [term.name for term in self.control_law.terms], self.actions[:, :0]
         if PD_CONTROL in names:

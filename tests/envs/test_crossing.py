@@ -29,9 +29,9 @@ def make_crossing(grounds, worlds, task="a1_position"):
 def tile_of(task, world):
     """Kind and level of a world's tile, found out by the heights of trenches and pits on the map."""
     origin = task.terrain.origins[world]
-    heights = task.terrain.height(origin + torch.tensor([[1.6, 0.0, 0.0], [1.8, 0.0, 0.0], [2.5, 0.0, 0.0]])).tolist()
+    places = origin + torch.tensor([[1.6, 0.0, 0.0], [1.8, 0.0, 0.0], [2.5, 0.0, 0.0]])
     trenches = {(0.0, 0.0, 0.0): ("flat", None), (-1.0, 0.0, 0.0): ("gaps", 0.2), (-1.0, -1.0, 0.0): ("gaps", 0.8)}
-    return trenches[tuple(heights)]
+    return trenches[tuple(task.terrain.map.height(places).tolist())]
 
 
 def test_crossings():
@@ -115,5 +115,5 @@ def test_random_tiles_differ():
     ground = make_terrain(grounds.cfg(A1Cfg(), 8).terrain, 8, "cpu")
     training = make_ground(terrain_proportions={"discrete_obstacles": 1.0}, difficulty_range=[0.5, 0.5], tile_size=8.0)
     places = torch.cartesian_prod(torch.arange(-3.5, 4.0, 0.5), torch.arange(-3.5, 4.0, 0.5), torch.zeros(1))
-    tiles = {tuple(of.height(origin + places).tolist()) for of in (ground, training) for origin in of.origins}
+    tiles = {tuple(of.map.height(origin + places).tolist()) for of in (ground, training) for origin in of.origins}
     assert len(tiles) == 4 + len({*zip(training.levels.tolist(), training.columns.tolist(), strict=True)})

@@ -15,7 +15,7 @@ BATCH = WORLDS * STEPS
 
 @pytest.fixture(scope="module")
 def make_runner(make_task):
-    """Factory of small runners, see :func:`support.runners.build_runner`."""
+    """Factory of small runners, see :func:`support.settings.build_runner`."""
 
     def make(name="a1_torque_multihead", **settings):
         return build_runner(make_task, name, WORLDS, **settings)

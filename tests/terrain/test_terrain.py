@@ -140,7 +140,7 @@ def test_map_is_put_together():
         stairs = heights[20 + 120 * row + 60, 20 + 180 : 20 + 240]
         np.testing.assert_allclose(np.diff(stairs).max(), 0.05 + 0.18 * difficulty, atol=1e-6)
     ground = make_ground()
-    surface = ground.height(ground.origins)
+    surface = ground.map.height(ground.origins)
     is_stairs = ground.columns == 1
     torch.testing.assert_close(surface[is_stairs], ground.origins[is_stairs, 2])
     assert (ground.origins[:, 2] >= surface).all()
@@ -189,7 +189,7 @@ def test_a_kind_of_ones_own(monkeypatch):
     only = {"cfg": names["RampCfg"](), "terrain_proportions": {"ramp": 1.0}, "difficulty_range": [0.5, 0.5]}
     ground = make_ground(**only)
     place = torch.tensor([[2.02, 0.0, 0.0]])
-    torch.testing.assert_close(ground.height(place), torch.tensor([0.15 * 2.02]))
+    torch.testing.assert_close(ground.map.height(place), torch.tensor([0.15 * 2.02]))
     monkeypatch.setitem(TILES, "ramp", lambda difficulty, rng, grid: np.zeros(3))
     line = error_of(make_ground, **only)
     assert line == "the kind of tile 'ramp' must return finite heights of shape (121, 121)"
@@ -262,7 +262,7 @@ def test_height_scan(make_rough_task):
     for world, heading in enumerate((0.8, -2.2)):
         cos, sin = math.cos(heading), math.sin(heading)
         points = position[world, :2] + torch.stack([cos * x - sin * y, sin * x + cos * y], dim=-1)
-        above = position[world, 2] - 0.5 - task.terrain.height(points)
+        above = position[world, 2] - 0.5 - task.terrain.map.height(points)
         expected[world] = 5.0 * above.clamp(-1.0, 1.0).flatten()
     assert (expected == -5.0).any() and expected.max() > 0.0
     obs, others = task.get_observations(), other.get_observations()

@@ -245,7 +245,7 @@ def test_tiles(make_session):
     ground, snapshot = session.task.terrain, session.snapshot
     assert snapshot.tile == (0, 0) and ground.levels.tolist() == [0, 1] and ground.columns.tolist() == [0, 1]
     assert snapshot.scan.shape == (17 * 11, 3)
-    np.testing.assert_allclose(snapshot.scan[:, 2], ground.height(torch.from_numpy(snapshot.scan)).numpy(), atol=1e-5)
+    np.testing.assert_allclose(snapshot.scan[:, 2], ground.map.height(torch.from_numpy(snapshot.scan)), atol=1e-5)
     np.testing.assert_allclose(snapshot.scan[:, :2].mean(axis=0), snapshot.qpos[0, :2], atol=1e-5)
     other = session.task.sim.qpos[1].clone()
     session.set_paused(True)
