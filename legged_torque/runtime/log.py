@@ -5,9 +5,9 @@ import io
 import struct
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from legged_torque.utils.errors import UserError
 try:
     import orjson
     from mcap.exceptions import EndOfFile
-    from mcap.records import Channel, McapRecord, Message, Metadata
-    from mcap.stream_reader import StreamReader
+    from mcap.reader import NonSeekingReader
     from mcap.writer import Writer
 except ImportError as error:
     raise UserError(f"logs need the extra: pip install 'legged_torque[robot]' ({error})") from None
@@ -34,6 +33,7 @@ it began after its time, ``lateness``, and the time it ``took`` until its comman
 """
 _NS = 1e9
 _CHUNK = 2**16  # bytes that are written at a time
+_Part = TypeVar("_Part")
 
 
 class Log:
@@ -118,7 +118,8 @@ class RecordedLog:
         """Open a log; a UserError if it is none."""
         try:
             self._file, self._content = file, file.read_bytes()
-            about = next(each.metadata for each in self._records() if isinstance(each, Metadata) and each.name == ROBOT)
+            parts = self._read(NonSeekingReader.iter_metadata)
+            about = next(part.metadata for part in parts if part.name == ROBOT)
             self.joint_order: list[str] = orjson.loads(about["joint_order"])
             self.sha256, self.task, self.period = about["sha256"], about["task"], float(about["period"])
             self.keeps_time = about.get("keeps_time") != "False"
@@ -143,18 +144,14 @@ class RecordedLog:
 
     def _messages(self, channel: str) -> Iterator[tuple[float, Any]]:
         """Yield times and contents of a channel's messages."""
-        number = None
-        for record in self._records():
-            if isinstance(record, Channel) and record.topic == channel:
-                number = record.id
-            if isinstance(record, Message) and record.channel_id == number:
-                yield record.log_time / _NS, orjson.loads(record.data)
+        for _, _, message in self._read(lambda reader: reader.iter_messages(channel, log_time_order=False)):
+            yield message.log_time / _NS, orjson.loads(message.data)
 
-    def _records(self) -> Iterator[McapRecord]:
-        """Yield what the file has, up to where it was cut off; a UserError if it is damaged before that."""
+    def _read(self, parts: Callable[[NonSeekingReader], Iterator[_Part]]) -> Iterator[_Part]:
+        """Yield parts of the file, up to where it was cut off; a UserError if it is damaged before that."""
         try:
             with contextlib.suppress(EndOfFile, struct.error):
-                yield from StreamReader(io.BytesIO(self._content), validate_crcs=True).records
+                yield from parts(NonSeekingReader(io.BytesIO(self._content), validate_crcs=True))
         except Exception as error:  # each kind of damage has its own
             raise UserError(f"'{self._file}' is no log of deploy.py, or damaged: {error}") from None
 
