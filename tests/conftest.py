@@ -85,6 +85,15 @@ def exported(make_task, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def exported_go2(make_task, tmp_path_factory):
+    """The same of ``go2_torque_multihead``."""
+    from support.exports import export_random
+
+    export_random(make_task, "go2_torque_multihead", folder := tmp_path_factory.mktemp("export") / "out")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def description(exported):
     """The contents of its ``policy.yaml``."""
     return yaml.safe_load((exported / "policy.yaml").read_text())

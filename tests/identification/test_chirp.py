@@ -4,7 +4,6 @@ import io
 
 import numpy as np
 import pytest
-from support.exports import export_random
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 from support.simulated import Simulated
@@ -20,17 +19,10 @@ from legged_torque.runtime.sim_robot import InProcess, SimRobot
 RATE, SECONDS = 500.0, 6.0
 
 
-@pytest.fixture(scope="module")
-def exported(make_task, tmp_path_factory):
-    """Folder of a random policy."""
-    export_random(make_task, "go2_torque_multihead", folder := tmp_path_factory.mktemp("chirp") / "out")
-    return folder
-
-
 @pytest.fixture
-def policy(exported):
+def policy(exported_go2):
     """The policy."""
-    return Policy(exported)
+    return Policy(exported_go2)
 
 
 def test_targets(policy):
@@ -49,7 +41,7 @@ def test_targets(policy):
     assert crossings == pytest.approx(2 * 5.05 * SECONDS, abs=3)  # two per turn, 5.05 Hz on average
 
 
-def test_hanging_robot(exported, policy, tmp_path):
+def test_hanging_robot(exported_go2, policy, tmp_path):
     """A simulated robot goes through all of it without a fault, its trunk at rest; the log is for identify.py.
 
     Another one, which replay.py hangs up as tilted as that, does the same wherever the log has a state.
@@ -72,11 +64,11 @@ def test_hanging_robot(exported, policy, tmp_path):
     moved = np.nanmax(measured[:, 0], axis=0) - np.nanmin(measured[:, 0], axis=0)
     assert len(measured) == SECONDS * RATE and (moved > 0.3).all()
     assert np.isnan(measured[:, 0, 0]).mean() == pytest.approx(0.05, abs=0.02)
-    status, said, _ = run_here("replay.py", "log.mcap", f"--policy={exported}", root=tmp_path)
+    status, said, _ = run_here("replay.py", "log.mcap", f"--policy={exported_go2}", root=tmp_path)
     assert status == 0 and said.count("never; 0.0000") == 12 and "bit by bit" not in said
     sweeps.description["task"] = "a1_position"
     Log(tmp_path / "other.mcap", controller).close()
-    refused = run_here("replay.py", "other.mcap", f"--policy={exported}", root=tmp_path)
+    refused = run_here("replay.py", "other.mcap", f"--policy={exported_go2}", root=tmp_path)
     assert_told_in_one_line(refused, "the log is of the task 'a1_position', the policy of 'go2_torque_multihead'")
 
 

@@ -49,14 +49,6 @@ while True:  # it moves on with each command, and repeats itself until the next 
 """
 
 
-@pytest.fixture(scope="module")
-def exported(make_task, tmp_path_factory):
-    """Folder of a random policy of a Go2."""
-    folder = tmp_path_factory.mktemp("deploy") / "out"
-    export_random(make_task, "go2_torque_multihead", folder)
-    return folder
-
-
 def walk(transport, policy, ticks):
     """Stand up, then let the policy act."""
     controller = Controller(policy, transport.joint_order, RATE, Brakes(stand_up=1.0))
@@ -90,9 +82,9 @@ def meet(transport, controller):
         pass
 
 
-def test_over_the_wire_as_in_process(exported, tmp_path):
+def test_over_the_wire_as_in_process(exported_go2, tmp_path):
     """A robot in another process ends where one in this process does; the wire rounds to float32."""
-    policy, ticks, xml = Policy(exported), round(1.3 * RATE), resource_path("resources/robots/go2/go2.xml")
+    policy, ticks, xml = Policy(exported_go2), round(1.3 * RATE), resource_path("resources/robots/go2/go2.xml")
     command = [sys.executable, "-c", SIDE, str(DOMAIN), str(xml)]
     with (tmp_path / "said").open("w") as file, subprocess.Popen(command, stdout=file) as process:
         try:
@@ -109,14 +101,14 @@ def test_over_the_wire_as_in_process(exported, tmp_path):
     assert place[2] > 0.2 and excess < 1.0 and not watchdog  # a busy machine holds commands
 
 
-def test_ctrl_c_in_the_farewell(exported, tmp_path, monkeypatch):
+def test_ctrl_c_in_the_farewell(exported_go2, tmp_path, monkeypatch):
     """A first one is only noted."""
     close = Session.close
     monkeypatch.setattr(Session, "close", lambda self: (signal.raise_signal(signal.SIGINT), close(self)))
-    assert run_here("deploy.py", str(exported), "--interface=sim", "--seconds=0.1", root=tmp_path)[::2] == (0, "")
+    assert run_here("deploy.py", str(exported_go2), "--interface=sim", "--seconds=0.1", root=tmp_path)[::2] == (0, "")
 
 
-def test_only_the_loop_goes_before_other_programs(exported, tmp_path, monkeypatch):
+def test_only_the_loop_goes_before_other_programs(exported_go2, tmp_path, monkeypatch):
     """What draws the view and writes the log does not."""
     try:
         before = os.sched_getscheduler(0), os.sched_getparam(0)
@@ -128,12 +120,12 @@ def test_only_the_loop_goes_before_other_programs(exported, tmp_path, monkeypatc
     for kind, name in ((View, "show"), (Log, "write")):
         monkeypatch.setattr(kind, name, lambda self: seen.add((type(self), thread().name, os.sched_getscheduler(0))))
     words = ["--interface=sim", "--seconds=0.1", "--log=log.mcap"]
-    assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
+    assert run_here("deploy.py", str(exported_go2), *words, root=tmp_path)[0] == 0
     aside = {(kind, policy) for kind, name, policy in seen if name != thread().name}
     assert aside == {(View, os.SCHED_OTHER), (Log, os.SCHED_OTHER)}
 
 
-def test_a_terminal_that_waits(exported, tmp_path):
+def test_a_terminal_that_waits(exported_go2, tmp_path):
     """A robot whose view cannot be written, as after Ctrl-S, is logged and stopped in time; its log is whole."""
     (end, full), log = os.pipe(), tmp_path / "log.mcap"
     os.set_blocking(full, False)
@@ -141,7 +133,7 @@ def test_a_terminal_that_waits(exported, tmp_path):
         while os.write(full, bytes(4096)):
             pass
     os.set_blocking(full, True)
-    words = [str(exported), "--interface=sim", "--walk", f"--log={log}"]
+    words = [str(exported_go2), "--interface=sim", "--walk", f"--log={log}"]
     with subprocess.Popen([sys.executable, str(ROOT / "scripts" / "deploy.py"), *words], stdout=full) as process:
         os.close(full)
         until, last = time.monotonic() + 120.0, b""
@@ -158,10 +150,10 @@ def test_a_terminal_that_waits(exported, tmp_path):
     assert [rest["mode"] for *_, rest in RecordedLog(log).ticks()][-1] == "damping"
 
 
-def test_an_output_that_nobody_reads_any_more(exported, tmp_path):
+def test_an_output_that_nobody_reads_any_more(exported_go2, tmp_path):
     """As after ``| head -1``: the session goes on to its end, and ends well."""
     log = tmp_path / "log.mcap"
-    command = [sys.executable, str(ROOT / "scripts" / "deploy.py"), str(exported)]
+    command = [sys.executable, str(ROOT / "scripts" / "deploy.py"), str(exported_go2)]
     command += ["--interface=sim", "--seconds=2", f"--log={log}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline().startswith("damping")
@@ -180,9 +172,9 @@ for sys.argv in %r:
 """
 
 
-def test_scripts_without_torch(exported, tmp_path):
+def test_scripts_without_torch(exported_go2, tmp_path):
     """What runs on a robot, and replay.py, need none of the packages of training; one file is enough."""
-    file = str(exported / "policy.onnx")
+    file = str(exported_go2 / "policy.onnx")
     calls = [["deploy.py", file, "--interface=sim", "--seconds=0.5", "--log=log.mcap"]]
     calls += [["replay.py", "log.mcap", f"--policy={file}"], ["sim_robot.py", "--seconds=0.2", "--domain=231"]]
     calls = [[str(ROOT / "scripts" / script), *words] for script, *words in calls]
@@ -229,11 +221,11 @@ class Faulty(Mine):
 """
 
 
-def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
+def test_robot_at_the_other_end(make_task, exported_go2, tmp_path, monkeypatch):
     """The robot's name, torque limits and transport are checked before anything moves; its firmware is printed once."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     (tmp_path / "own_robot.py").write_text(OWN)
-    own = ["deploy.py", str(exported), "--interface=own_robot.py:Mine"]
+    own = ["deploy.py", str(exported_go2), "--interface=own_robot.py:Mine"]
     status, output, _ = run_here(*own, "--robot=go2", "--seconds=0.3", root=tmp_path)
     assert (status, output.count("the robot's firmware is [1, 2], its serial number [3, 4]")) == (0, 1)
     assert_told_in_one_line(run_here(*own, "--robot=a1", root=tmp_path), "--robot must be 'go2'")
@@ -259,22 +251,22 @@ def test_robot_at_the_other_end(make_task, exported, tmp_path, monkeypatch):
 
     monkeypatch.setattr("legged_torque.runtime.dds.Go2Robot", joined)
     for words, joins in ((["lo"], "lo 1"), (["eth0"], "eth0 0"), (["lo", "--domain=0"], "lo 0")):
-        words = ["deploy.py", str(exported), "--robot=go2", "--interface", *words]
+        words = ["deploy.py", str(exported_go2), "--robot=go2", "--interface", *words]
         assert_told_in_one_line(run_here(*words, root=tmp_path), joins)
     status, output, _ = command("sim-robot", "--robot=go2", "--help")
     assert status == 0 and output.startswith("usage: legged-torque sim_robot ")
 
 
-def test_scripts(make_task, exported, tmp_path):
+def test_scripts(make_task, exported_go2, tmp_path):
     """Both scripts begin and end by themselves; what they are told wrongly is refused in one line."""
-    own = [str(exported), "--interface=sim", "--seconds=0.3", "--log=log.mcap"]
+    own = [str(exported_go2), "--interface=sim", "--seconds=0.3", "--log=log.mcap"]
     status, output, _ = run_here("deploy.py", *own, root=tmp_path)
     assert status == 0 and "damping" in output and "99.9% within" in output
-    replay = ["replay.py", "log.mcap", f"--policy={exported}"]
+    replay = ["replay.py", "log.mcap", f"--policy={exported_go2}"]
     status, output, _ = run_here(*replay, "--plot=gap.png", root=tmp_path)
     assert status == 0 and "RL_calf_joint: never; 0.0000" in output and (tmp_path / "gap.png").stat().st_size > 1000
     words = ["--interface=lo", f"--domain={OTHER}", "--seconds=0.3"]
-    assert run_here("deploy.py", str(exported), *words, root=tmp_path)[0] == 0
+    assert run_here("deploy.py", str(exported_go2), *words, root=tmp_path)[0] == 0
     status, output, _ = run_here("sim_robot.py", *words, "--fault=hot=FR_hip_joint", "--fault=lost=1", root=tmp_path)
     assert status == 0 and "sport mode normal" in output
     for script, wrong, message in (
@@ -296,7 +288,7 @@ def test_scripts(make_task, exported, tmp_path):
         ("sim_robot.py", ["--fault=lost=2"], "--fault lost must be from 0 to 1, not 2"),
         ("sim_robot.py", ["--fault=delay=nan"], "--fault delay must be finite"),
     ):
-        given = [str(exported)] if script == "deploy.py" else []
+        given = [str(exported_go2)] if script == "deploy.py" else []
         assert_told_in_one_line(run_here(script, *given, *wrong, root=tmp_path), message)
     for words, message in (
         ([*replay, "--limit=-1"], "limit"),

@@ -3,15 +3,12 @@
 import json
 import sys
 
-from support.exports import export_random
-
 from tools import faults
 
 
-def test_each_fault_ends_in_damping(make_task, tmp_path, monkeypatch, capsys):
+def test_each_fault_ends_in_damping(exported_go2, tmp_path, monkeypatch, capsys):
     """One of each kind; no torque beyond limits, unless a joint is set to another speed or place."""
-    export_random(make_task, "go2_torque_multihead", tmp_path / "out")
-    words = ["faults", str(tmp_path / "out"), "--trials", str(len(faults.KINDS))]
+    words = ["faults", str(exported_go2), "--trials", str(len(faults.KINDS))]
     monkeypatch.setattr(sys, "argv", [*words, "--json", str(tmp_path / "faults.json")])
     faults.main()
     rows = json.loads((tmp_path / "faults.json").read_text())["rows"]
