@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from support.exports import XML, export_random
 from support.scripts import run_here
-from support.settings import error_of
+from support.settings import BusCfg, error_of
 
 from legged_torque.deploy.description import read
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.robot import MujocoRobot
 from legged_torque.deploy.simulation import Latency, Simulation
-from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot, task_registry
-from legged_torque.motors.config import DelayCfg
+from legged_torque.envs import A1TorqueCfgPPO, TorqueRobot, task_registry
 
 
 def test_constant_delays(make_task, tmp_path):
@@ -44,16 +43,6 @@ def test_constant_delays(make_task, tmp_path):
     for t, applied in enumerate(torques):
         expected = scale * sent[(t - 6) // 4] if t >= 6 else np.zeros(12)
         np.testing.assert_allclose(applied, expected, rtol=1e-6)
-
-
-class BusCfg(A1TorqueCfg):
-    """An A1 whose delay has a name of its own."""
-
-    class motors:
-        chain = ["bus", "ideal"]
-
-        class bus(DelayCfg):
-            pass
 
 
 @pytest.mark.parametrize("link", ["delay", "bus"])

@@ -1,11 +1,10 @@
 """``--motors FILE``: what cannot be in it."""
 
 import pytest
-from support.settings import error_of
+from support.settings import BusCfg, error_of
 
-from legged_torque.envs import LeggedRobotCfg, task_registry
+from legged_torque.envs import task_registry
 from legged_torque.envs.base.asset import load_asset
-from legged_torque.motors.config import DelayCfg
 from legged_torque.utils.options import Options, simulated_latency
 
 REFUSED = {
@@ -44,16 +43,6 @@ def test_delay_of_a_simulated_robot(tmp_path, delay, late):
         cfg = task_registry.get_cfgs("go2_torque")[0]
         name = str(tmp_path / motors) if "." in motors else motors
         assert simulated_latency(cfg, name, given) == pytest.approx(expected)
-
-
-class BusCfg(LeggedRobotCfg):
-    """A robot whose delay has a name of its own."""
-
-    class motors:
-        chain = ["bus", "ideal"]
-
-        class bus(DelayCfg):
-            pass
 
 
 def test_delay_of_another_name(tmp_path):

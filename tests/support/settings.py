@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import A1TorqueCfg, task_registry
+from legged_torque.motors.config import DelayCfg
 from legged_torque.utils.cli import TRAINING, Parser, add_options, add_task_args, options_of
 from legged_torque.utils.config import set_by_path
 from legged_torque.utils.errors import UserError
@@ -19,6 +20,16 @@ OTHER_ROBOTS = []  # their tasks, in the order of their registration
 for robot in ("anymal_c", "g1", "go1", "go2"):
     OTHER_ROBOTS += [f"{robot}_{approach}" for approach in APPROACHES]
     OTHER_ROBOTS += [f"{robot}_rough_{approach}{scan}" for approach in APPROACHES for scan in ("", "_scan")]
+
+
+class BusCfg(A1TorqueCfg):
+    """An A1 whose delay has a name of its own."""
+
+    class motors:
+        chain = ["bus", "ideal"]
+
+        class bus(DelayCfg):
+            pass
 
 
 def parse(*words):
