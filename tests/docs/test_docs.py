@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from support.documents import DOCS, ROOT
+from support.documents import DOCS
+from support.scripts import ROOT
 from support.settings import build_runner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 import warp
-from support.documents import ROOT, fences, make, python_files, train
-from support.scripts import command, run_here
+from support.documents import fences, make, python_files, train
+from support.scripts import ROOT, command, run_here
 from support.settings import parse
 
 from legged_torque.envs import task_registry

@@ -19,7 +19,7 @@ import torch
 import yaml
 from support.reproducible import differences, values
 from support.rollouts import make_ppo, record_rollout, state_of
-from support.scripts import PATHS
+from support.scripts import PATHS, ROOT
 from support.settings import parse
 
 from legged_torque.envs import task_registry
@@ -31,7 +31,6 @@ from legged_torque.utils.errors import TrainingError
 from legged_torque.utils.runs import checkpoint_number, find_checkpoint
 from legged_torque.utils.task_registry import set_seed
 
-ROOT = Path(__file__).resolve().parents[2]
 WORLDS, STEPS = 2, 4
 ALL_STEPS = 2 * WORLDS * STEPS
 """Environment steps of an iteration of both processes."""

@@ -12,7 +12,7 @@ import pytest
 import torch
 import yaml
 from support.clock import Clock
-from support.scripts import COMMAND, PATHS, assert_told_in_one_line, run_here
+from support.scripts import COMMAND, PATHS, ROOT, assert_told_in_one_line, run_here
 from support.settings import build_runner
 
 from legged_torque.envs import task_registry
@@ -20,7 +20,6 @@ from legged_torque.envs.base.curriculum import LinearCurriculum
 from legged_torque.learning.training_display import TrainingDisplay
 from legged_torque.utils.options import Options
 
-ROOT = Path(__file__).resolve().parents[2]
 STEPS, WORLDS = 4, 2
 SMALL = [f"--num_envs={WORLDS}", f"--set=runner.num_steps_per_env={STEPS}", "--set=algorithm.num_mini_batches=2"]
 SMALL += ["--device=cpu", "--logger=none", "--set=evaluation.interval=0", "--task=a1_position"]

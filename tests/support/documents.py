@@ -1,14 +1,13 @@
 """Pages and tables of the documents, the numbers in them, and their code with its tasks on the CPU."""
 
 import re
-from pathlib import Path
 
 import torch
+from support.scripts import ROOT
 
 from legged_torque.envs import task_registry
 from legged_torque.utils.options import Options
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 TASKS = {
     "PD": "a1_position",
