@@ -1,4 +1,4 @@
-"""Order, failures, locks and signals of an experiment, with stand-ins for the scripts."""
+"""Order, failures, locks and signals of an experiment, with stand-ins for the scripts, and for NVIDIA's service."""
 
 import fcntl
 import json
@@ -14,8 +14,9 @@ from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
-from legged_torque.experiments.local_launcher import GPU_JOBS, LocalLauncher, LocalProcess
+from legged_torque.experiments.local_launcher import GPU_JOBS, MPS, LocalLauncher, LocalProcess, multi_process_service
 from legged_torque.experiments.matrix import CellState, read_matrix
+from legged_torque.utils.errors import UserError
 
 
 @pytest.fixture
@@ -99,27 +100,37 @@ def test_steps_that_only_seem_to_succeed(stage, tmp_path, behaviour, message):
     assert any(" from 2" in line for line in trained(stage)) == (behaviour == "early")
 
 
+def break_pipe(monkeypatch, word):
+    """Let the experiment print nothing with this word: its reader has ended."""
+
+    def gone(*texts, **options):
+        if word in texts[0]:
+            raise BrokenPipeError
+        print(*texts, **options)
+
+    monkeypatch.setattr(experiment_run, "print", gone, raising=False)
+
+
+def start_to_interrupt(out):
+    """Start a thread that sends this process SIGINT when a training is under way; return it."""
+
+    def stop():
+        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    return thread
+
+
 def test_stop_where_nobody_reads(stage, tmp_path, monkeypatch):
     """Trainings are asked once and save, too, if the reader of the output has ended by the same Ctrl-C."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("slow")
-
-    def gone(*texts, **options):
-        """Print, but no word of stopping: the pipe is broken."""
-        if "Stopping" in texts[0]:
-            raise BrokenPipeError
-        print(*texts, **options)
-
-    def stop():
-        """Send the signal when the training is under way."""
-        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(experiment_run, "print", gone, raising=False)
+    break_pipe(monkeypatch, "Stopping")
     asked, terminate = [], LocalProcess.terminate
     monkeypatch.setattr(LocalProcess, "terminate", lambda self: asked.append(self) or terminate(self))
-    thread = threading.Thread(target=stop)
-    thread.start()
+    thread = start_to_interrupt(out)
     experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
     assert len(asked) == 1 and max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
@@ -128,14 +139,7 @@ def test_stop_where_nobody_reads(stage, tmp_path, monkeypatch):
 def test_nobody_reads(stage, tmp_path, monkeypatch):
     """The trainings in work are asked to stop, and no other is begun."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
-
-    def gone(*texts, **options):
-        """Print, but no word of what is done: the pipe is broken."""
-        if " took " in texts[0]:
-            raise BrokenPipeError
-        print(*texts, **options)
-
-    monkeypatch.setattr(experiment_run, "print", gone, raising=False)
+    break_pipe(monkeypatch, " took ")
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 130
     assert trained(stage) == ["a1_position-low-s1"]
 
@@ -144,14 +148,7 @@ def test_stop(stage, tmp_path):
     """Trainings save before this process ends with status 130, and go on the next time."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("slow")
-
-    def stop():
-        """Send the signal when the training is under way."""
-        wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
-        os.kill(os.getpid(), signal.SIGINT)
-
-    thread = threading.Thread(target=stop)
-    thread.start()
+    thread = start_to_interrupt(out)
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
     assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
@@ -321,3 +318,37 @@ def test_devices(places, monkeypatch):
         assert sorted(variables[::2]) == sorted(names * 2) and variables[1::2] == ["3"] * 4
     assert places(LocalLauncher("cuda:1", 1), 1) == (["cuda:1"], ["5", "None"])
     assert LocalLauncher("auto", None).room() == 2 * GPU_JOBS
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """A program that notes arguments, input, folder and devices, and may refuse; returns where it notes them."""
+    notes, file = tmp_path / "notes", tmp_path / MPS
+    noted = '$*|$([ "$1" ] || cat)|$CUDA_MPS_PIPE_DIRECTORY|$CUDA_VISIBLE_DEVICES'
+    stays = f'[ "$1" ] && {{ sleep 60 & echo $! > {notes}.pid; }}'  # with its output open, as a service does
+    file.write_text(f'#!/bin/sh\necho "{noted}" >> {notes}\n{stays}\necho "it is $1"\n[ ! -e {notes}.no ]\n')
+    file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    yield notes
+    os.kill(int(notes.with_name("notes.pid").read_text()), signal.SIGKILL)  # fails if it was waited for
+
+
+def test_mps(program, monkeypatch):
+    """It runs with a folder of its own while the context is open, also when that ends by an error, and no longer."""
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "/mine")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")  # would be 0, 1 to programs that use the service
+    before = dict(os.environ)
+    with pytest.raises(KeyError), multi_process_service() as variables:
+        (folder,) = set(variables.values())
+        assert variables.keys() == {"CUDA_MPS_PIPE_DIRECTORY", "CUDA_MPS_LOG_DIRECTORY"}
+        assert os.path.isdir(folder) and program.read_text() == f"-d||{folder}|\n"
+        raise KeyError
+    assert program.read_text().splitlines()[1:] == [f"|quit|{folder}|"]
+    assert dict(os.environ) == before and not os.path.exists(folder)
+
+
+def test_mps_that_refuses(program):
+    """Its words are the error, and the work is not begun."""
+    program.with_name("notes.no").touch()
+    with pytest.raises(UserError, match=f"--mps: {MPS} says: it is -d"), multi_process_service():
+        raise AssertionError("the service has not started")

@@ -1,10 +1,11 @@
-"""The small helpers: vectors and headings, renderers, busy cores, paths."""
+"""The small helpers: vectors and headings, renderers, busy cores, paths, seconds by stage."""
 
 import ctypes.util
 import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -105,3 +106,22 @@ def test_without_machine(monkeypatch, tmp_path):
     settings = {"file": "/tmp/a.pt", "scale": 0.5, "names": ["a/b", "runner.file=/tmp/b.pt", "x=1/2", None]}
     expected = {"file": "a.pt", "scale": 0.5, "names": ["a/b", "runner.file=b.pt", "x=1/2", None]}
     assert without_machine(settings) == expected
+
+
+PROGRAM = """import time
+from legged_torque.utils.stopwatch import stopwatch
+for stage in ("a", "b", "a"):
+    time.sleep(0.2)
+    stopwatch.lap(stage)
+print(stopwatch, *stopwatch.seconds.values(), sep=" | ")
+"""
+
+
+def test_every_second_counts():
+    """A stage may go on later; the first has the process's start too, and all together are no more than its life."""
+    began = time.perf_counter()
+    output = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True).stdout
+    lived = time.perf_counter() - began
+    text, first, second = output.split(" | ")
+    assert text == f"a {float(first):.1f} s, b {float(second):.1f} s"
+    assert float(second) >= 0.2 and float(first) > 0.4 + 0.01 and float(first) + float(second) <= lived + 0.02
