@@ -6,8 +6,7 @@ import shlex
 import shutil
 
 import pytest
-from support.scripts import ROOT, assert_told_in_one_line, contents, run_here
-from support.strangers import LOADING
+from support.scripts import LOADING, ROOT, assert_told_in_one_line, contents, run_here
 
 from legged_torque.utils.options import Options
 from legged_torque.utils.policies import POLICIES_DIR

@@ -6,9 +6,8 @@ import shutil
 import pytest
 import torch
 import yaml
-from support.scripts import assert_told_in_one_line, run_here
+from support.scripts import Payload, assert_told_in_one_line, run_here
 from support.settings import error_of
-from support.strangers import Payload
 
 from legged_torque import resource_path
 from legged_torque.deploy.export import write_description

@@ -7,9 +7,8 @@ import zipfile
 import pytest
 import torch
 import yaml
-from support.scripts import SMALL, assert_told_in_one_line, contents, run_here
+from support.scripts import LOADING, SMALL, Payload, assert_told_in_one_line, contents, edit_config, load_run, run_here
 from support.settings import error_of, get_cfgs, parse
-from support.strangers import LOADING, Payload, edit_config, load_run
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.robots.a1 import A1Cfg, A1CfgPPO
