@@ -139,27 +139,25 @@ def test_tilt():
         assert tilt_of(np.array([np.cos(half), 0.0, 0.0, np.sin(half)])) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_numbers_that_hide_others():
-    """A robot does not walk on if no joint can be said to be the hottest, or to have an error."""
+def fault_of(**changes):
+    """The fault of a state in wide limits, but for these changes."""
     state, wide = random_state(np.random.default_rng(0)), np.array([[-99.0] * 12, [99.0] * 12])
     joints = Joints([f"joint {i}" for i in range(12)], wide, wide, wide[1])
-    assert fault(state, 0.0, Received(), joints, Brakes()) == ""
+    return fault(replace(state, **changes), 0.0, Received(), joints, Brakes())
+
+
+def test_numbers_that_hide_others():
+    """A robot does not walk on if no joint can be said to be the hottest, or to have an error."""
+    assert fault_of() == ""
+    numbers = np.where(np.arange(12) == 3, np.nan, np.where(np.arange(12) == 5, 130.0, 0.0))
     for name in ("temperatures", "errors"):
-        numbers = np.where(np.arange(12) == 3, np.nan, np.where(np.arange(12) == 5, 130.0, 0.0))
-        said = fault(replace(state, **{name: numbers}), 0.0, Received(), joints, Brakes())
-        assert said == f"a measurement is not finite, of {name}"
+        assert fault_of(**{name: numbers}) == f"a measurement is not finite, of {name}"
 
 
 def test_error_flags_of_other_types():
     """They may be negative or floats, as of a transport of one's own."""
-    state, wide = random_state(np.random.default_rng(0)), np.array([[-99.0] * 12, [99.0] * 12])
-    joints = Joints([f"joint {i}" for i in range(12)], wide, wide, wide[1])
     for error, said in ((-2.0, "-0x2"), (16, "0x10")):
-        flags = np.where(np.arange(12) == 3, error, 0)
-        assert (
-            fault(replace(state, errors=flags), 0.0, Received(), joints, Brakes())
-            == f"joint 3 has {said} as error flag"
-        )
+        assert fault_of(errors=np.where(np.arange(12) == 3, error, 0)) == f"joint 3 has {said} as error flag"
 
 
 def test_from_lying_to_walking_and_back(policy):
