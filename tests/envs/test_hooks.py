@@ -117,5 +117,6 @@ def test_successors_exist():
 
 def test_old_names_on_the_command_line():
     """They are answered with their successors, sections included."""
-    for path, successor in {"commands.resampling_time": "resampling_probability", "viewer.pos": "cameras"}.items():
+    successors = {"commands.resampling_time": "resampling_probability", "viewer.pos": "cameras"}
+    for path, successor in (successors | {"domain_rand.trunk_mass_offset": "domain_rand.trunk_mass"}).items():
         assert successor in error_of(get_cfgs, f"--set={path}=1")

@@ -176,9 +176,3 @@ def test_an_older_run_is_loaded():
     cfg = get_cfgs(run_config={"env": old, "train": {}})[0]
     assert cfg.domain_rand.dof_damping == {"set": [0.0, 0.2]} and cfg.motors.delay.range == [0, 6]
     assert to_dict(get_cfgs(run_config={"env": today, "train": {}})[0]) == today
-
-
-def test_old_names_are_refused():
-    """An old name on the command line is refused with the new one."""
-    line = error_of(get_cfgs, "--set=domain_rand.trunk_mass_offset=[-2, 2]")
-    assert "domain_rand.trunk_mass" in line
