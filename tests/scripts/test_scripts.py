@@ -1,18 +1,24 @@
 """The scripts as a user runs them: mistakes in one line; training, stopping, resuming and playing fit together."""
 
+import contextlib
 import math
 import os
 import re
+import resource
 import signal
 import subprocess
 import threading
 
+import pytest
 import torch
 import yaml
 from support.clock import wait_for
-from support.scripts import COMMAND, PATHS, ROOT, SMALL, run_here
+from support.scripts import COMMAND, PATHS, ROOT, SMALL, assert_told_in_one_line, run_here
+from support.settings import error_of
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged_torque import RESOURCES_DIR
+from legged_torque.learning.evaluator import append_row
 from legged_torque.utils.interrupt import StopRequest
 from legged_torque.utils.runs import checkpoint_file, checkpoint_numbers
 
@@ -200,3 +206,53 @@ def test_info(tmp_path):
     for title in ("versions", "machine", "GPU", "caches", "extras", "videos"):
         assert f"\n{title}\n  " in output
     assert not list(tmp_path.iterdir())
+
+
+LIMIT = 600  # bytes
+A1 = RESOURCES_DIR / "robots" / "a1" / "a1.xml"
+COMMANDS = {
+    "train.py": ([*SMALL, "--log_root={out}"], []),
+    "evaluate.py": (["--task=a1_position", "--load_run={run}", "--steps=2", "--json={out}/a.json"], ["a.json"]),
+    "export.py": (["--task=a1_position", "--load_run={run}", "--out={out}"], ["policy.onnx", "policy.yaml"]),
+    "import_robot.py": ([str(A1), "--name=full", "--out={out}", "--force"], ["full.py", "full.xml"]),
+    "report.py": (["{run}", "--out={out}"], ["report.html", "report.md", "table.csv"]),
+}
+"""Arguments of scripts, and the files that they would replace in the folder ``out``."""
+
+
+@contextlib.contextmanager
+def full_disk():
+    """Context in which no file can become longer than the limit."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("script", COMMANDS)
+def test_scripts(trained, tmp_path, script):
+    """One line, exit status 2, files as they were and no unfinished ones."""
+    if script == "report.py":
+        pytest.importorskip("pandas", reason="the extra 'plots' is not installed")
+    words, names = COMMANDS[script]
+    (out := tmp_path / "out").mkdir()
+    for name in names:
+        (out / name).write_text("old")
+    with full_disk():
+        words = [word.format(out=out, run=trained["a1_position"]) for word in words]
+        assert_told_in_one_line(run_here(script, *words, root=tmp_path), "File too large")
+    files = {path.relative_to(out).as_posix(): path.read_text() for path in out.rglob("*") if path.is_file()}
+    assert files == dict.fromkeys(names, "old")
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_rows_of_evaluations(tmp_path):
+    """A row that does not fit leaves no part of it."""
+    row = {"steps": 10**99, "track_xy": 0.5}
+    with full_disk():
+        for _ in range(5):
+            append_row(tmp_path / "rows.csv", row)
+        assert "File too large" in error_of(append_row, tmp_path / "rows.csv", row)
+    assert (tmp_path / "rows.csv").read_text() == "steps,track_xy\n" + f"{10**99},0.5\n" * 5
