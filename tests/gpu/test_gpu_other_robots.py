@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-import torch
-from support.fused import AIR, FIELDS, FLOOR, compiled, draw_states, make_crab, put, random, step_mujoco
-from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, results, step, thrown
+from support.fused import AIR, FIELDS, FLOOR, assert_applied_forces_act, compiled, draw_states, make_crab, step_mujoco
+from support.on_device import assert_matches, assert_move_as_alone, make_robot, make_sim, step, thrown
 
 
 def test_two_long_legs(device):
@@ -27,19 +26,7 @@ def crab():
 def test_unlike_legs_under_applied_forces(device, crab):
     """Wrenches on all bodies and forces on all degrees of freedom act as in MuJoCo, and each of them acts."""
     model, states = crab
-    count = len(states["qpos"])
-    wrenches, forces = random((count, model.nbody, 6), -5.0, 5.0, 1), random((count, model.nv), -3.0, 3.0, 2)
-    sim = make_sim(model, count, device)
-    without = step_mujoco(model, states)
-    for of_bodies, of_joints in ((wrenches, forces), (wrenches, 0.0 * forces), (0.0 * wrenches, forces)):
-        put(sim, states)
-        for applied, values in zip(sim.applied_forces(), (of_bodies, of_joints), strict=True):
-            applied.copy_(torch.tensor(values))
-        sim.step()
-        velocities = step_mujoco(model, states, of_bodies, of_joints)[0]
-        error = np.abs(results(sim)[0] - velocities).max(axis=1)
-        assert np.median(error) < 1e-4 and error.max() < 5e-3, error.max()
-        assert (np.abs(velocities - without[0]).max(axis=1) > 0.05).all()
+    assert_applied_forces_act(make_sim(model, len(states["qpos"]), device), model, states)
 
 
 def test_worlds_do_not_see_each_other(device, crab):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from support.control import LEGS, SENSED, WEIGHT, contacts_by_hand
-from support.fused import ROBOTS, compiled, draw_states, make_a1, put, random, step_mujoco
+from support.fused import ROBOTS, assert_applied_forces_act, compiled, draw_states, make_a1, put, random, step_mujoco
 
 from legged_torque.sim.engine import CAPABILITIES
 from legged_torque.sim.registry import ENGINES, make_engine
@@ -277,18 +277,8 @@ class EngineSuite:
         self.need("applied_forces")
         model = compiled(ROBOTS[self.pushed]())
         states = draw_states(model, 20, self.height)
-        xfrc, qfrc = random((20, model.nbody, 6), -5.0, 5.0, 1), random((20, model.nv), -3.0, 3.0, 2)
         sim = self.make(20, model, iterations=(100, 50))
-        for on_bodies, on_joints in ((xfrc, qfrc), (xfrc, 0.0 * qfrc), (0.0 * xfrc, qfrc)):
-            put(sim, states)
-            for applied, values in zip(sim.applied_forces(), (on_bodies, on_joints), strict=True):
-                applied.copy_(torch.tensor(values))
-            sim.step()
-            expected = step_mujoco(model, states, on_bodies, on_joints)[0]
-            error = np.abs(sim.qvel.double().numpy() - expected).max(axis=1)
-            assert np.median(error) < 1e-4 and error.max() < 5e-3
-            without = step_mujoco(model, states)[0]
-            assert (np.abs(expected - without).max(axis=1) > 0.05).all()
+        assert_applied_forces_act(sim, model, states)
         mask = torch.arange(20) == 3
         sim.reset(mask)
         for applied in sim.applied_forces():

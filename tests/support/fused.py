@@ -136,6 +136,22 @@ def assert_alike(model, states, actual, expected, worst=2e-3, median=2e-5):
     assert (np.abs(actual[3] - expected[3]).max(axis=(1, 2)) < 3e-3 * largest).all()
 
 
+def assert_applied_forces_act(sim, model, states):
+    """Wrenches on all bodies and forces on all degrees of freedom act as in MuJoCo, and each of them acts."""
+    wrenches = random((len(states["qpos"]), model.nbody, 6), -5.0, 5.0, 1)
+    forces = random((len(states["qpos"]), model.nv), -3.0, 3.0, 2)
+    without = step_mujoco(model, states)[0]
+    for on_bodies, on_joints in ((wrenches, forces), (wrenches, 0.0 * forces), (0.0 * wrenches, forces)):
+        put(sim, states)
+        for applied, values in zip(sim.applied_forces(), (on_bodies, on_joints), strict=True):
+            applied.copy_(torch.tensor(values))
+        sim.step()
+        expected = step_mujoco(model, states, on_bodies, on_joints)[0]
+        error = np.abs(sim.qvel.double().cpu().numpy() - expected).max(axis=1)
+        assert np.median(error) < 1e-4 and error.max() < 5e-3, error.max()
+        assert (np.abs(expected - without).max(axis=1) > 0.05).all()
+
+
 def random(size, low, high, seed=0):
     """Random numbers between two limits."""
     return np.random.default_rng(seed).uniform(low, high, size)
