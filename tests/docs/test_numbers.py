@@ -120,10 +120,8 @@ def test_hard_ranges():
     assert f"than PD with {tracking['high']['a1_position']:.3f}." in text
     assert f"PD tracks {own.mean():.3f} ({own.min():.3f} to {own.max():.3f}), the" in text
     assert f"methods track {low.min():.3f} to {low.max():.3f}, not" in text
-    assert [len(better[name, "track_angular"]) for name in ("low", "high")] == [
-        5,
-        3,
-    ] and "In `low` five torque methods and in `high` three turn" in text
+    turning = [len(better[name, "track_angular"]) for name in ("low", "high")]
+    assert turning == [5, 3] and "In `low` five torque methods and in `high` three turn" in text
     assert better["low", "track_xy"] == better["high", "track_xy"] == []
     change = {metric: mean[metric].unstack("task") for metric in ("track_angular", "cost_of_transport")}
     less = {metric: 1.0 - of.div(of["a1_position"], axis=0) for metric, of in change.items()}

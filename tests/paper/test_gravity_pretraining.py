@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 import torch
-from support.control import mirror_joints, mirror_policy
+from support.control import TORQUE_LIMIT, WEIGHT, mirror_joints, mirror_policy
 from support.gravity import FEW, STD, TASK, words_of
 from support.settings import error_of, get_cfgs, parse
 from tensordict import TensorDict
@@ -25,8 +25,7 @@ from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBod
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 
-WEIGHT = 12.453 * 9.81
-TORQUE_SCALE, TORQUE_LIMIT = 8.0, 33.5
+TORQUE_SCALE = 8.0
 LAST_ACTION = slice(33, 45)
 """Columns of the last action in the observations: after 9 numbers of the trunk, 12 angles and 12 velocities."""
 

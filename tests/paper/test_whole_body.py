@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from support.control import TORQUE_LIMIT, WEIGHT
 
 from legged_torque.envs import task_registry
 from legged_torque.paper.gravity.dynamics import RobotDynamics
@@ -15,8 +16,6 @@ from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBod
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.options import Options
 
-TORQUE_LIMIT = 33.5
-WEIGHT = 12.453 * 9.81
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 AT_REST = WholeBodySettings(
     position_stiffness=0.0, attitude_stiffness=0.0, joint_stiffness=0.0, foot_stiffness=0.0, task_damping=0.0
