@@ -1,6 +1,7 @@
 """Runs a matrix of trainings on a launcher. Finished steps are skipped, interrupted ones resumed."""
 
 import contextlib
+import signal
 import subprocess
 import sys
 import time
@@ -36,7 +37,7 @@ class CountedStop(StopRequest):
 
     def _handle(self, number: int) -> None:
         """Count a signal."""
-        self.requested = True
+        self.requested, self.number = True, self.number or number
         self.count += 1
 
 
@@ -58,7 +59,7 @@ class ExperimentRun:
         self._stop, self._unread = CountedStop(), 0
 
     def run(self) -> int:
-        """Work until all cells are done or have failed; return the exit status. Asked to stop: KeyboardInterrupt."""
+        """Work until all cells are done or have failed; return the exit status, that of a signal to stop."""
         print(f"{self._num_done} of {self._num_cells} cells are done in {self._out}", flush=True)
         passed_on = 0
         try:
@@ -86,7 +87,8 @@ class ExperimentRun:
             print(failure, file=sys.stderr)
         print(*filter(None, [spent, f"{self._num_done} of {self._num_cells} cells are done."]), sep="\n", flush=True)
         if self._stop.requested:
-            raise KeyboardInterrupt
+            print("interrupted", file=sys.stderr)
+            return 128 + (self._stop.number or signal.SIGINT)
         return 1 if self._failures else 0
 
     def _take_cells(self) -> None:

@@ -111,12 +111,12 @@ def break_pipe(monkeypatch, word):
     monkeypatch.setattr(experiment_run, "print", gone, raising=False)
 
 
-def start_to_interrupt(out):
-    """Start a thread that sends this process SIGINT when a training is under way; return it."""
+def start_to_stop(out, number):
+    """Start a thread that sends this process a signal when a training is under way; return it."""
 
     def stop():
         wait_for(lambda: any("iteration 3 of 4" in log.read_text() for log in out.glob("*/train.log")))
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
     thread = threading.Thread(target=stop)
     thread.start()
@@ -130,7 +130,7 @@ def test_stop_where_nobody_reads(stage, tmp_path, monkeypatch):
     break_pipe(monkeypatch, "Stopping")
     asked, terminate = [], LocalProcess.terminate
     monkeypatch.setattr(LocalProcess, "terminate", lambda self: asked.append(self) or terminate(self))
-    thread = start_to_interrupt(out)
+    thread = start_to_stop(out, signal.SIGINT)
     experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
     assert len(asked) == 1 and max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
@@ -144,14 +144,16 @@ def test_nobody_reads(stage, tmp_path, monkeypatch):
     assert trained(stage) == ["a1_position-low-s1"]
 
 
-def test_stop(stage, tmp_path):
-    """Trainings save before this process ends with status 130, and go on the next time."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stop(stage, tmp_path, number):
+    """Trainings save before this process ends with the status of the signal, and go on the next time."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (stage / "behaviour").write_text("slow")
-    thread = start_to_interrupt(out)
+    thread = start_to_stop(out, number)
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     thread.join()
-    assert (status, error) == (130, "interrupted\n") and "Stopping: " in output and "0 of 2 cells are done." in output
+    assert (status, error) == (128 + number, "interrupted\n")
+    assert "Stopping: " in output and "0 of 2 cells are done." in output
     assert max(path.name for path in out.glob("*/*/model_*")) == "model_3.pt"
     (stage / "behaviour").write_text("")
     assert experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)[0] == 0

@@ -104,7 +104,7 @@ def test_stop(here, stage, tmp_path):
     thread = during(stage, out, lambda: os.kill(os.getpid(), signal.SIGTERM))
     status, output, error = here()
     thread.join()
-    assert (status, error) == (130, "interrupted\n"), output
+    assert (status, error) == (143, "interrupted\n"), output
     assert [(cell / "run_0" / "model_3.pt").is_file() for cell in out.glob("*-s1")] == [True] * 2
     (stage / "scripts" / "behaviour").write_text("")
     status, output, error = here()
