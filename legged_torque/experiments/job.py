@@ -1,5 +1,6 @@
 """A step of a cell while it runs: a training or an evaluation, in a process that a launcher has started."""
 
+import contextlib
 import fcntl
 import os
 import shlex
@@ -14,6 +15,7 @@ from legged_torque.experiments.times import STEPS, read_times, write_times
 from legged_torque.learning.training_display import UNIT, read_tracking
 from legged_torque.utils.display import read_progress
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.files import write_errors
 
 LOST = 256
 """Exit status of a step whose machine is gone. No process ends with it."""
@@ -96,11 +98,12 @@ class Job:
             print(f"{self.cell.name}: its device time is not kept: {error}", file=sys.stderr)
 
     def output(self) -> str:
-        """Return the end of what the step has written so far."""
-        with self.log.open("rb") as file:
+        """Return the end of what the step has written so far; nothing if its log is gone, without which it goes on."""
+        with contextlib.suppress(OSError), self.log.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(self._log_start, size - TAIL))
             return file.read().decode(errors="replace")
+        return ""
 
     def progress(self) -> tuple[str, float, str]:
         """Return what the step does, the fraction of it that is done, and its tracking and time left, for the user."""
@@ -136,12 +139,16 @@ class Job:
 
 
 def try_lock(file: Path) -> BinaryIO | None:
-    """Lock a new or old file until it is closed here and in all processes that inherit it; None if another holds it."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    lock = file.open("ab")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        lock.close()
-        return None
+    """Lock a new or old file until it is closed here and in all processes that inherit it; None if another holds it.
+
+    A UserError if it cannot be written.
+    """
+    with write_errors(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock = file.open("ab")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.close()
+            return None
     return lock

@@ -96,7 +96,12 @@ class ExperimentRun:
         for cell in list(self._queue):
             if self._stop.requested or len(self._running) >= self._launcher.room():
                 return
-            lock = try_lock(cell.folder / "lock")
+            try:
+                lock = try_lock(cell.folder / "lock")
+            except UserError as error:
+                self._queue.remove(cell)
+                self._fail(cell, str(error), [])
+                continue
             if lock is None:
                 if cell not in self._reported:
                     self._reported.add(cell)

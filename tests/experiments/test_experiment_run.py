@@ -14,6 +14,7 @@ from support.scripts import assert_told_in_one_line, contents
 
 from legged_torque.experiments import matrix as experiment
 from legged_torque.experiments import run as experiment_run
+from legged_torque.experiments.job import Job
 from legged_torque.experiments.local_launcher import GPU_JOBS, MPS, LocalLauncher, LocalProcess, multi_process_service
 from legged_torque.experiments.matrix import CellState, read_matrix
 from legged_torque.utils.errors import UserError
@@ -72,6 +73,25 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
     listed = experiment_here(file, f"--out={out}", "--device=cpu", "--dry-run", tmp_path=tmp_path)
     status, _, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
     assert status == 1 and error.endswith(" lack max_iterations\n") and listed == (0, f"{error}{other}: done\n", "")
+
+
+def test_a_lock_that_cannot_be_taken_fails_its_cell_only(stage, tmp_path):
+    """What is wrong is told in one line."""
+    file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
+    (out / "a1_position-low-s1" / "lock").mkdir(parents=True)
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    lock = out / "a1_position-low-s1" / "lock"
+    assert (status, error) == (1, f"a1_position-low-s1: cannot write '{lock}': Is a directory\n")
+    assert "1 of 2 cells are done." in output and trained(stage) == ["a1_torque-low-s1"]
+
+
+def test_a_log_that_is_deleted(stage, tmp_path, monkeypatch):
+    """It ends nothing, although its last lines are asked for."""
+    file, out, problem = write(tmp_path / "m.yaml", SMALL), tmp_path / "out", Job.problem
+    (stage / "behaviour").write_text("fail a1_position-low-s1")
+    monkeypatch.setattr(Job, "problem", lambda self: self.log.unlink(missing_ok=True) or problem(self))
+    status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
+    assert status == 1 and "1 of 2 cells are done." in output and error.endswith("train.log:\n")
 
 
 def test_a_training_that_is_killed_is_tried_again(stage, tmp_path):
