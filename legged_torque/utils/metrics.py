@@ -58,6 +58,11 @@ class Estimate:
     standard_error: float
 
 
+def told(line: str) -> str:
+    """Return a line of results with - for what was not measured, and without standard errors of a single world."""
+    return line.replace("nan +- nan", f"{'-':>12}").replace(" +- nan", "")  # means are wider than NaN by two
+
+
 def tracking_percentage(xp: ModuleType, error: Array, commands: Array) -> tuple[Array, Array]:
     """Return how much of its commands each world follows, and 1 where anything was commanded, else 0.
 

@@ -71,7 +71,8 @@ def test_one_file_is_enough(exported, description, tmp_path):
     assert alone.description == both.description == description
     obs = np.random.default_rng(0).normal(size=57)
     assert alone.act(obs).tobytes() == both.act(obs).tobytes()
-    assert run_here("sim2sim.py", str(file), "--steps=2", "--robots=1", root=tmp_path)[0] == 0
+    status, output, _ = run_here("sim2sim.py", str(file), "--steps=2", "--robots=1", root=tmp_path)
+    assert status == 0 and "  speed " in output and "+-" not in output  # of one robot
 
 
 @pytest.mark.parametrize("kept", [(), ("joint_order", "nominal_pose", "observations", "actions")])

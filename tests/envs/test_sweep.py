@@ -176,4 +176,5 @@ def test_script(tmp_path):
     ):
         assert_told_in_one_line(run_here("evaluate.py", *few, *words, root=tmp_path), message)
     status, output, errors = run_here("evaluate.py", *few, "--sweep=ground_friction", "--json=out.json", root=tmp_path)
-    assert status == 0 and "ground_friction []" in output, errors
+    assert status == 0 and "ground_friction []" in output and " nan" not in output, errors
+    assert f" {'-':>18} {'-':>18} {'-':>18}\n" in output  # a part that no world is in
