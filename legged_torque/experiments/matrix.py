@@ -13,10 +13,10 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
-from legged_torque.utils.config import flat, section_keys, to_dict
+from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError, check_names
 from legged_torque.utils.limits import Count, Worlds, check_value, types_of
-from legged_torque.utils.options import Options, draw_only
+from legged_torque.utils.options import Options, draw_only, refuse_of_trainings
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
     checkpoint_number,
@@ -180,10 +180,8 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
         check_names("perturbation", cell.evaluated_in, env_cfg.perturbations())
         for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
             options.set = [*words, *set_words(settings)]
-            for key in flat(settings):
-                if key.split(".")[0] in section_keys(train_cfg):
-                    raise UserError(f"{key} of {evaluation} cannot be set: evaluations do not read it")
             changed = task_registry.get_new_cfgs(options)[0]
+            refuse_of_trainings(flat(settings), evaluation, changed)
             changed.commands.curriculum = False  # as evaluations have it
             check_env_cfg(changed)
             if evaluation.startswith(SWEEP):

@@ -1,6 +1,7 @@
 """The options that scripts share, as plain values, and the changes that they make to settings."""
 
 import copy
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -116,6 +117,14 @@ def apply_options(env_cfg: Any, train_cfg: Any, options: Options, run_config: di
         checked_path("", section, list(sections))
         set_by_path(sections[section], path, value)
     train_cfg.refuse_unread(path for path, _ in changes)
+
+
+def refuse_of_trainings(paths: Iterable[str], what: str, env_cfg: Any) -> None:
+    """Raise a UserError if a setting, by its dotted path, is not one of the task: loaded policies read no others."""
+    sections = section_keys(env_cfg)
+    for path in paths:
+        if path.split(".")[0] not in sections:
+            raise UserError(f"{what} cannot set {path}, which is for trainings; allowed: {', '.join(sections)}")
 
 
 def choose_motors(env_cfg: Any, name: str) -> str:

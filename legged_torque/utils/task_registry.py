@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING, Any
 
 from legged_torque import resource_path
 from legged_torque.utils import distributed, runs
-from legged_torque.utils.config import BaseConfig, section_keys
+from legged_torque.utils.config import BaseConfig
 from legged_torque.utils.devices import resolve_device
 from legged_torque.utils.errors import UserError, printable, unknown_name
 from legged_torque.utils.files import importable, remove_stale_parts
-from legged_torque.utils.options import Options, apply_options
+from legged_torque.utils.options import Options, apply_options, refuse_of_trainings
 from legged_torque.utils.policies import policy_dir
 
 if TYPE_CHECKING:
@@ -228,9 +228,8 @@ class TaskRegistry:
         if options.task and task != options.task:
             raise UserError(f"the run '{folder}' is of task '{task}', not '{options.task}'")
         cfgs = self.get_cfgs(task, options, config)
-        for item in options.set if not options.resume else ():
-            if item.partition("=")[0].split(".")[0] in section_keys(cfgs[1]):
-                raise UserError(f"--set {item} is for trainings, not for a run that is loaded")
+        if not options.resume:
+            refuse_of_trainings((item.partition("=")[0] for item in options.set), "--set", cfgs[0])
         robot, trained = cfgs[0].asset.file, config["env"].get("asset", {}).get("file", cfgs[0].asset.file)
         if robot != trained:
             from legged_torque.utils.mjcf import robot_notes  # which imports mujoco
