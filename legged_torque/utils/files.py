@@ -47,8 +47,8 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 def part_of(path: Path) -> Path:
-    """Return the path at which this process writes a file or folder until it is finished."""
-    return path.with_name(f"{path.name}.{os.getpid()}.part")
+    """Return the path at which this process, of this machine, writes a file or folder until it is finished."""
+    return path.with_name(f"{path.name}.{os.uname().nodename}.{os.getpid()}.part")
 
 
 def write_whole(file: Path, content: bytes | str) -> None:
@@ -119,9 +119,9 @@ def held(lock: Path) -> Iterator[None]:
 
 
 def remove_stale_parts(folder: Path) -> None:
-    """Remove the unfinished files of killed processes from a folder."""
+    """Remove the unfinished files of killed processes of this machine from a folder; others may share it."""
     for path in folder.glob("*.part"):
-        writer = re.search(r"\.(\d+)\.part$", path.name)
+        writer = re.search(rf"\.{re.escape(os.uname().nodename)}\.(\d+)\.part$", path.name)
         try:
             os.kill(int(writer[1]) if writer else os.getpid(), 0)
         except ProcessLookupError:

@@ -1,5 +1,6 @@
 """A resumed training gives the same bits as one that never stopped, or says in a line why its worlds start anew."""
 
+import os
 import re
 import shutil
 import threading
@@ -257,12 +258,13 @@ def test_a_damaged_run_is_passed_over(half, tmp_path, capsys):
 
 
 def test_what_killed_processes_have_left_is_removed(copied):
-    """Those of processes that run are not touched."""
-    dead, alive = copied / "model_3.pt.999999999.part", copied / "model_3.pt.1.part"
-    for file in (dead, alive):
+    """Those of processes that run, or may run on another machine, are not touched."""
+    host = os.uname().nodename
+    dead, *others = (copied / f"model_3.pt.{of}.part" for of in (f"{host}.999999999", f"{host}.1", "other.999999999"))
+    for file in (dead, *others):
         file.touch()
     start(None, "--resume", f"--load_run={copied}")
-    assert not dead.exists() and alive.exists()
+    assert not dead.exists() and all(file.exists() for file in others)
 
 
 def test_a_checkpoint_is_of_its_iteration(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from support.settings import error_of, get_cfgs
 from legged_torque import __version__
 from legged_torque.utils import runs
 from legged_torque.utils.config import flat, to_dict
-from legged_torque.utils.files import write_whole
+from legged_torque.utils.files import part_of, write_whole
 
 
 @pytest.fixture
@@ -155,7 +155,9 @@ def test_no_run_is_without_its_settings(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         runs.claim_run_dir(tmp_path / "run", {})
     assert not list(tmp_path.iterdir())
-    (tmp_path / "run.999999999.part").mkdir()  # of a process that was killed
+    monkeypatch.setattr(os, "getpid", lambda: 999999999)  # a process that was killed
+    part_of(tmp_path / "run").mkdir()
+    assert (tmp_path / f"run.{os.uname().nodename}.999999999.part").is_dir()  # on shared disks, others have that number
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) != [runs.claim_run_dir(tmp_path / "run", {})] == list(tmp_path.iterdir())
 
