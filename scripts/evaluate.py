@@ -24,7 +24,7 @@ from legged_torque.utils.devices import device_name
 from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
-from legged_torque.utils.metrics import UNITS, told
+from legged_torque.utils.metrics import UNITS, hide_nan
 from legged_torque.utils.options import PUSH, draw_only
 from legged_torque.utils.runs import package_versions
 from legged_torque.utils.task_registry import LoadedRun, set_seed
@@ -121,7 +121,7 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     size = f"{counted(env.num_envs, 'world')} x {counted(num_steps, 'step')}"
     print(f"{run.checkpoint}, after {counted(trained, 'step')} of training, {size}:")
     for name, estimate in metrics.items():
-        print(told(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}"))
+        print(hide_nan(f"  {name:<18} {estimate.mean:10.4f} +- {estimate.standard_error:.4f} {UNITS[name]}"))
     if not is_fixed:
         print(f"  {'command':<19} {'from':>6} {'to':>6} {'share':>6} {'tracking [share]':>16} {'error':>16}")
     line = "  {:<19} {from:>6.2f} {to:>6.2f} {share:>6.2f} "
@@ -130,7 +130,7 @@ def walk(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, num_steps: in
     for name, parts in breakdown.table().items():
         what = f"{name} [{'rad/s' if name == 'ang_vel_yaw' else 'm/s'}]"
         for part in parts:
-            print(told((line + "{error:7.3f} +- {error_standard_error:.3f}").format(what, **part)))
+            print(hide_nan((line + "{error:7.3f} +- {error_standard_error:.3f}").format(what, **part)))
     shown = {name: asdict(estimate) for name, estimate in metrics.items()}
     return {"num_steps": num_steps, "metrics": shown, "by_command": breakdown.table()}
 
@@ -145,7 +145,7 @@ def sweep(args: argparse.Namespace, run: LoadedRun, env: LeggedRobot, runner: On
     size = f"{counted(env.num_envs, 'world')} x {counted(args.steps, 'step')}"
     print(f"{run.checkpoint}, after {counted(runner.logger.tot_timesteps, 'step')} of training, {size}:")
     for line in parts.lines():
-        print(told(line))
+        print(hide_nan(line))
     return {"num_steps": args.steps, "sweep": {"parameter": parts.name, "unit": parts.unit, "parts": parts.table()}}
 
 
@@ -159,7 +159,7 @@ def cross_tiles(run: LoadedRun, env: LeggedRobot, runner: OnPolicyRunner, ground
     print(f"{run.checkpoint}, after {counted(trained, 'step')} of training, {counted(env.num_envs, 'world')}, {trial}:")
     print(f"  {'kind':<18} {'level':>6} {'worlds':>6} {'crossed':>16} {'fell':>16} {'tracking':>9} {'cost':>6}")
     for result in results:
-        shares = [told(f"{share.mean:.3f} +- {share.standard_error:.3f}") for share in (result.crossed, result.fell)]
+        shares = [hide_nan(f"{each.mean:.3f} +- {each.standard_error:.3f}") for each in (result.crossed, result.fell)]
         tracking, cost = (result.metrics[name].mean for name in ("track_percentage", "cost_of_transport"))
         place = f"  {result.kind:<18} {result.level:>6g} {result.worlds:>6}"
         print(f"{place} {shares[0]:>16} {shares[1]:>16} {tracking:>9.3f} {cost:>6.2f}")

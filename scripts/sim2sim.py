@@ -73,7 +73,7 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.deploy.robot import MujocoRobot
         from legged_torque.deploy.simulation import Simulation, evaluate
-        from legged_torque.utils.metrics import UNITS, told
+        from legged_torque.utils.metrics import UNITS, hide_nan
         from legged_torque.utils.mjcf import set_joints
         from legged_torque.viewer.native import simulation_window
         from legged_torque.viewer.video import SimulationRecorder
@@ -111,7 +111,7 @@ def main() -> None:
     control_step = 1.0 / policy.description["timing"]["control_frequency"]
     print(f"  {counted(args.robots, 'robot')} x {counted(args.steps, 'step')} of {control_step:g} s")
     for name, value in metrics.items():
-        print(told(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}"))
+        print(hide_nan(f"  {name:<18} {value.mean:10.4f} +- {value.standard_error:.4f} {UNITS[name]}"))
     if args.json:
         result = {key: str(value) if isinstance(value, Path) else value for key, value in vars(args).items()}
         result |= {"task": policy.description["task"], "training": training, "notes": notes}

@@ -58,7 +58,7 @@ class Estimate:
     standard_error: float
 
 
-def told(line: str) -> str:
+def hide_nan(line: str) -> str:
     """Return a line of results with - for what was not measured, and without standard errors of a single world."""
     return line.replace("nan +- nan", f"{'-':>12}").replace(" +- nan", "")  # means are wider than NaN by two
 

@@ -7,6 +7,7 @@ import re
 import resource
 import signal
 import subprocess
+import sys
 import threading
 
 import pytest
@@ -222,17 +223,19 @@ COMMANDS = {
 
 @contextlib.contextmanager
 def full_disk():
-    """Context in which no file can become longer than the limit."""
+    """Context in which no file can become longer than the limit; bytecode that was cut off would break later tests."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    writes_bytecode, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, limits[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        sys.dont_write_bytecode = writes_bytecode
 
 
 @pytest.mark.parametrize("script", COMMANDS)
-def test_scripts(trained, tmp_path, script):
+def test_a_full_disk(trained, tmp_path, script):
     """One line, exit status 2, files as they were and no unfinished ones."""
     if script == "report.py":
         pytest.importorskip("pandas", reason="the extra 'plots' is not installed")
@@ -248,7 +251,7 @@ def test_scripts(trained, tmp_path, script):
     assert not list(tmp_path.rglob("*.part"))
 
 
-def test_rows_of_evaluations(tmp_path):
+def test_evaluations_on_a_full_disk(tmp_path):
     """A row that does not fit leaves no part of it."""
     row = {"steps": 10**99, "track_xy": 0.5}
     with full_disk():
