@@ -1,4 +1,4 @@
-"""The sets of random ranges and perturbations, ranges that make no sense, and those of older runs."""
+"""The sets of random ranges and perturbations, and ranges that make no sense."""
 
 from pathlib import Path
 
@@ -11,7 +11,6 @@ from support.settings import error_of, get_cfgs
 
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.older_runs import converted, is_older
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.utils.config import set_by_path, to_dict
 
@@ -149,30 +148,3 @@ def test_sums(make_task):
     friction = sim.field("geom_friction")[:, 0].numpy() / model.geom_friction[0]
     assert 1.5 <= friction.min() < 1.6 and 1.9 < friction.max() <= 2.0
     np.testing.assert_allclose(friction, friction[:, :1].repeat(3, axis=1), rtol=1e-5)
-
-
-RANGES = yaml.safe_load(Path(__file__).with_name("older_run.yaml").read_text("utf-8"))
-"""``domain_rand`` of such a run, and what it is today."""
-
-
-def test_ranges_of_an_older_run():
-    """Each parameter has the ranges that were drawn: shares where there was no number, none that were kept fixed."""
-    values = {"domain_rand": RANGES["before"], "motors": {"model": "ideal"}, "env": {"num_envs": 3}}
-    assert is_older(values)
-    new = converted(values)
-    assert new["env"] == {"num_envs": 3}
-    assert new["motors"] == {"delay": {"range": [0, 6], "unit": "physics_steps"}}
-    assert new["domain_rand"] == RANGES["after"]
-
-
-def test_an_older_run_is_loaded():
-    """A task takes the settings of such a run, and those of today's runs as they are."""
-    today = to_dict(get_cfgs("--perturbation=low")[0])
-    assert not is_older(today)
-    old = today | {
-        "domain_rand": {k: v for k, v in RANGES["before"].items() if k != "thigh_mass_scale"},
-        "motors": {"model": "ideal"},
-    }
-    cfg = get_cfgs(run_config={"env": old, "train": {}})[0]
-    assert cfg.domain_rand.dof_damping == {"set": [0.0, 0.2]} and cfg.motors.delay.range == [0, 6]
-    assert to_dict(get_cfgs(run_config={"env": today, "train": {}})[0]) == today

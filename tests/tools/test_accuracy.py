@@ -1,8 +1,6 @@
-"""Accuracy of the default settings, in states of every kind, against converged plain MuJoCo, and faults over DDS."""
+"""The accuracy of the default settings, in states of every kind, against converged plain MuJoCo."""
 
-import json
 import math
-import sys
 
 import mujoco
 import numpy as np
@@ -13,7 +11,6 @@ from support.scripts import SMALL, run_here
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.sim.registry import ENGINES, make_engine
-from tools import faults
 from tools.accuracy import KINDS, copy_state, make_states, measure_accuracy, open_motors, reference_step
 
 WORLDS = 120
@@ -85,16 +82,3 @@ def test_script(tmp_path):
     assert status == 0 and any(line.startswith("a1_position on CPU") for line in lines)
     assert [[cell.strip() for cell in row] for row in rows] == [[kind, engine] for kind in KINDS for engine in ENGINES]
     assert run_here("../tools/accuracy.py", *words, "--steps=0", root=tmp_path)[0] == 2
-
-
-def test_each_fault_ends_in_damping(exported_go2, tmp_path, monkeypatch, capsys):
-    """One of each kind; no torque beyond limits, unless a joint is set to another speed or place."""
-    words = ["faults", str(exported_go2), "--trials", str(len(faults.KINDS))]
-    monkeypatch.setattr(sys, "argv", [*words, "--json", str(tmp_path / "faults.json")])
-    faults.main()
-    rows = json.loads((tmp_path / "faults.json").read_text())["rows"]
-    assert [row["fault"] for row in rows] == [*faults.KINDS]
-    assert all(0.0 < row["ms"] < 1e3 * faults.LIMIT for row in rows)
-    beyond = [row["excess"] for row in rows if not row["fault"].startswith("joint")]
-    assert max(beyond) < 1.0  # N m: a busy machine may hold a command for some milliseconds
-    assert f"{len(rows)} faults" in capsys.readouterr().out
