@@ -8,6 +8,7 @@ from scipy import stats
 from support.documents import DOCS, rows_of, same, text_of
 
 from legged_torque.envs import task_registry
+from legged_torque.paper.report.tables import welch
 from legged_torque.utils.options import Options
 
 KEPT = "lam=0.9 gamma=0.97 desired_kl=0.03"
@@ -100,6 +101,28 @@ def test_equivariant_networks():
     )
     first, second = (runs.apply(lambda run: run[run["track_percentage"] >= 0.7]["steps"].min()) for runs in both)
     assert f"70% takes {np.exp(np.log(first / second).dropna().mean()):.2f} times the steps" in text
+
+
+def test_energy_of_equivariant_networks():
+    """Costs of transport with equivariant networks and with mirror images, of trainings that learned."""
+    text = text_of("tried.md", "**Equivariant networks in place").replace("\n", " ")
+    rough = pd.read_csv(DOCS / "results" / "rough" / "evaluations.csv.gz").query("steps > 246e6")
+    rough = rough[rough["task"] == "a1_rough_torque_multihead"].groupby(["environment", "seed"])
+    rough = rough[["track_percentage", "cost_of_transport"]].mean().query("track_percentage > 0.6")["cost_of_transport"]
+    ours, images = rough["low, equivariant networks"], rough["low, mirror images"]
+    said = f"of {ours.min():.2f} to {ours.max():.2f}, with mirror images {images.min():.2f} to {images.max():.2f} (four"
+    assert f"{said} seeds each that learned, p = {welch(ours, images):.3f};" in text and {len(ours), len(images)} == {4}
+    late = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('late10/') and steps > 90e6")
+    late = late.groupby(["run", "task", "seed"])["cost_of_transport"].mean()
+    ours, images = late["late10/equivariant"], late["late10/images"]
+    lows, highs = ours.groupby("task").min(), ours.groupby("task").max()
+    said = "default torque has {:.2f} to {:.2f} (five seeds), with mirror images {:.2f} and {:.2f} (two, p = {:.2f};"
+    ends = lows["a1_torque"], highs["a1_torque"], *sorted(images["a1_torque"])
+    assert said.format(*ends, welch(images["a1_torque"], ours["a1_torque"])) in text
+    said = "stiffness {:.2f} to {:.2f}, with mirror images {:.2f} and {:.2f}, with learning rates up to 1e-2 {:.2f} and"
+    name = "a1_variable_stiffness"
+    ends = lows[name], highs[name], *sorted(images[name]), *sorted(late["late10/rates"][name])
+    assert f"{said} {{:.2f}}. Why".format(*ends) in text
 
 
 def after(seconds):

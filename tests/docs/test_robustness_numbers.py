@@ -4,7 +4,6 @@ import re
 
 import pandas as pd
 import pytest
-from scipy import stats
 from support.documents import DOCS, TASKS, rows_of, same, text_of
 
 from legged_torque.paper.report.tables import holm, welch
@@ -24,10 +23,17 @@ def trained_as(policy):
     tasks = TASKS | {"variable stiffness": "a1_variable_stiffness", "decaying PD bias": "a1_decap"}
     tasks["combination"] = "a1_torque_curriculum_multihead"
     more = {"tuned": "tuned gains", "damping": "damping on the drive", "history": "history of 3"}
-    robot, method, late, how = re.fullmatch(r"(?:(Go2): )?(.+), (\d+ ms)((?:, \w+)*)", policy.strip("*")).groups()
-    trained = ", ".join([f"late by 0 to {late}", *(more[each] for each in how.split(", ")[1:])])
-    task = tasks[method].replace("a1_", f"{(robot or 'a1').lower()}_")
-    return {"late by 0 to 10 ms, damping on the drive": "damping on the drive"}.get(trained, trained), task
+    method, late, how = re.fullmatch(r"(.+?), (\d+ ms)((?:, \w+)*)", policy.strip("*")).groups()
+    return ", ".join([f"late by 0 to {late}", *(more[each] for each in how.split(", ")[1:])]), tasks[method]
+
+
+def p_text(first, second):
+    """How the documents write p of Welch's test."""
+    p = welch(first, second)
+    return "p < 0.001" if p < 0.001 else f"p = {p:.3f}" if p < 0.0095 else f"p = {p:.2f}"
+
+
+RECIPE, MORE = "default torque, 20 ms, damping, history", "torque multi-head, 20 ms, damping, history"
 
 
 def test_cures_of_latency(swept):
@@ -35,56 +41,41 @@ def test_cures_of_latency(swept):
     columns = [("action_delay", "track_percentage", steps) for steps in (0.0, 4.0, 6.0)]
     columns += [("push_velocity", "fell", 3.5)]
     _, rows = rows_of("results.md", "policy, latest actions in training")
-    assert len(rows) == 21
-    for policy, seeds, *cells in rows:
+    assert len(rows) == 12
+
+    def values(policy, column):
         trained, task = trained_as(policy)
-        for cell, column in zip(cells, columns, strict=True):
-            values = swept.loc[(trained, *column, task)]
-            low, high = cell.split(", ")
-            assert len(values) == int(seeds) and same(low, values.min()) and same(high, values.max()), (policy, column)
-    text = text_of("results.md", "- **Default torque control can")
-    recipe, tuned = "late by 0 to 20 ms, damping on the drive, history of 3", "late by 0 to 20 ms, tuned gains"
-    _, torque, later, fell = (swept.loc[(recipe, *column, "a1_torque")] for column in columns)
-    _, position, later_pd, fell_pd = (swept.loc[(tuned, *column, "a1_position")] for column in columns)
-    test = stats.ttest_ind(torque, position, equal_var=False)
-    low, high = test.confidence_interval()
-    more = ("damping on the drive", "history of 3")
-    assert f"tracks {torque.mean():.4f}, PD, tuned and trained with it, {position.mean():.4f}" in text
-    assert f"(95% interval of the difference {low:.3f} to {high:.3f})" in text
-    assert f"over {fell.mean():.2f} instead of {fell_pd.mean():.2f} (p = {welch(fell, fell_pd):.3f};" in text
-    untuned = swept.loc[("late by 0 to 10 ms", *columns[3], "a1_position")]
-    assert f"10 ms {untuned.mean():.2f}, p = {welch(fell, untuned):.2f})" in text
-    for_30 = swept.loc[("late by 0 to 30 ms, tuned gains", *columns[2], "a1_position")]
-    said = f"tracks {later_pd.mean() - later.mean():.3f} less (p = {welch(later, later_pd):.3f}), and "
-    assert f"{said}{for_30.mean() - later.mean():.3f} less than PD trained" in text
-    before = [
-        swept.loc[(f"{trained} (earlier)", *column, task)].mean()
-        for column in (columns[1], columns[3])
-        for trained, task in ((recipe, "a1_torque"), (tuned, "a1_position"))
-    ]
-    assert "gave {:.3f} against {:.3f}, and {:.2f} against {:.2f}.".format(*before) in text
-    damped, past = (swept.loc[(f"late by 0 to 20 ms, {how}", *columns[1], "a1_torque")] for how in more)
-    assert f"tracks {damped.mean():.3f} (p = {welch(damped, torque):.2f}, three seeds against seven)" in text
-    assert "alone {0:.3f}, {2:.3f} and {1:.3f}".format(*past) in text
-    late = swept.loc[("late by 0 to 20 ms", *columns[1], "a1_torque")]
-    assert f"with neither, {late.min():.3f} to {late.max():.3f} (three seeds, " in text and len(late) == 3
-    own, pd_20 = (
-        [swept.loc[(trained, *column, task)] for column in columns[1:]]
-        for trained, task in ((recipe, "go2_torque"), (tuned, "go2_position"))
+        return swept.loc[(trained, *columns[column], task)]
+
+    for policy, *cells in rows:
+        for column, cell in enumerate(cells):
+            found, (low, high) = values(policy, column), cell.split(", ")
+            assert len(found) == 5 and same(low, found.min()) and same(high, found.max()), (policy, column)
+    text = text_of("results.md", "- **Torque with damping and latency")
+    (at_20, at_30, fell), (more_20, more_30, more_fell), (pd_20, pd_30, pd_fell) = (
+        [values(policy, column) for column in (1, 2, 3)] for policy in (RECIPE, MORE, "PD, 20 ms, tuned")
     )
-    low, high = stats.ttest_ind(own[0], pd_20[0], equal_var=False).confidence_interval()
-    (at_20, at_30, falls), (pd_at_20, pd_at_30, pd_falls) = ([part.mean() for part in parts] for parts in (own, pd_20))
-    said = f"tracks {pd_at_20 - at_20:.3f} less than tuned PD at 20 ms (95% interval {low:.3f} to {high:.3f}), at "
-    said += f"30 ms {pd_at_30 - at_30:.3f} (p = {welch(own[1], pd_20[1]):.3f}); pushes knock over {falls:.2f} instead "
-    assert f"{said}of {pd_falls:.2f} (p = {welch(own[2], pd_20[2]):.2f})" in text
-    falls = (
-        swept.xs(3.5, level="from").xs(("push_velocity", "fell"), level=("parameter", "metric")).groupby(level=[0, 1])
+    said = f"tracks {at_20.mean():.3f}, torque multi-head {more_20.mean():.3f}, PD {pd_20.mean():.3f}"
+    assert f"{said} ({p_text(at_20, pd_20)} and {welch(more_20, pd_20):.3f});" in text
+    said = f"over {fell.mean():.2f}, {more_fell.mean():.2f} and {pd_fell.mean():.2f} ({p_text(fell, pd_fell)} and "
+    assert f"{said}{p_text(more_fell, pd_fell)})" in text
+    less = [pd_30.mean() - each.mean() for each in (at_30, more_30)]
+    said = "{:.3f} and {:.3f} less than PD ".format(*less)
+    assert f"{said}({p_text(at_30, pd_30)} and {p_text(more_30, pd_30)})," in text
+    seen, pd_seen = values("torque multi-head, 30 ms, damping, history", 2), values("PD, 30 ms, tuned", 2)
+    assert f"that has seen them {pd_seen.mean() - seen.mean():.3f} ({p_text(seen, pd_seen)})." in text
+    before = []
+    for policy in (RECIPE, "PD, 20 ms, tuned"):
+        trained, task = trained_as(policy)
+        before.append(swept.loc[(f"{trained} (former defaults)", *columns[1], task)])
+    said = "defaults, it tracked {:.3f} in seven seeds and PD {:.3f};".format(*(each.mean() for each in before))
+    assert said in text and [len(each) for each in before] == [7, 5]
+    (plain, plain_fell), (damped, damped_fell) = (
+        [values(f"torque multi-head, 20 ms{how}", column) for column in (2, 3)] for how in ("", ", damping")
     )
-    falls, late = falls.mean(), "late by 0 to 10 ms"
-    said = "more fall ({:.2f} instead of {:.2f})"
-    assert said.format(falls["damping on the drive", "a1_torque"], falls[late, "a1_torque"]) in text
-    late_30 = falls["late by 0 to 30 ms", "a1_torque_multihead"], falls[late, "a1_torque_multihead"]
-    assert "multi-head ({:.2f} instead of {:.2f})".format(*late_30) in text
+    assert f"not seen: {damped.mean():.3f} instead of {plain.mean():.3f} at 30 ms ({p_text(damped, plain)})" in text
+    said = f"{damped_fell.mean():.2f} instead of {plain_fell.mean():.2f} ({p_text(damped_fell, plain_fell)}), and less "
+    assert f"{said}again with **history**, {more_fell.mean():.2f} ({p_text(more_fell, damped_fell)})" in text
     fast = swept.loc["policy at 200 Hz", "action_delay", "track_percentage", 0.0, "a1_torque_multihead"]
     assert f"track {fast.min():.2f} to {fast.max():.2f} without latency after" in text
 
@@ -104,44 +95,58 @@ MEASURED |= {"peak force [N]": ("drop 50 cm", "peak_force")}
 
 
 def test_table_of_conditions(conditions):
-    """Means over seeds, and which differ significantly from PD for 10 ms, the last row from PD for 20 ms."""
-    columns, rows = rows_of("results.md", "policy | seeds | undisturbed")
+    """Means over seeds, and which differ significantly from PD for 10 ms, the last two rows from PD for 20 ms."""
+    columns, rows = rows_of("results.md", "policy | undisturbed")
     of = conditions.set_index(["trained", "task", "condition", "metric"]).sort_index(kind="stable")["mean"]
-    assert len(rows) == 9
-    for number, column in enumerate(columns[2:]):
-        fewer = 2 * (column == "peak force [N]")  # rows with a seed less
+    assert len(rows) == 10
+    for number, column in enumerate(columns[1:]):
         measured = MEASURED.get(column, (column, "track_percentage"))
         values = [of[(*trained_as(policy), *measured)] for policy, *_ in rows]
         differs = [False, *(p < 0.05 for p in holm([welch(each, values[0]) for each in values[1:7]])), False]
-        differs.append(welch(values[8], values[7]) < 0.05)
+        differs += [welch(each, values[7]) < 0.05 for each in values[8:]]
         digits = 3 if measured[1] == "track_percentage" else 0
         found = [f"{each.mean():.{digits}f}" + "*" * int(star) for each, star in zip(values, differs, strict=True)]
-        assert [cells[1 + number] for _, *cells in rows] == found, column
-        assert [len(each) for each in values] == [
-            int(seeds) - (0 < i <= fewer) for i, (_, seeds, *_) in enumerate(rows)
-        ]
+        assert [cells[number] for _, *cells in rows] == found, column
+        assert {len(each) for each in values} == {5}
 
 
 def test_other_conditions(conditions):
-    """What is said of drops, ideal motors and SATA; of smoothness and noise, stars of the table say it."""
+    """What is said of drops, a dead leg, former defaults and SATA; of the rest, stars of the table say it."""
     text, late = text_of("results.md", "**Other conditions**"), "late by 0 to 10 ms"
-    of = conditions.set_index(["trained", "condition", "metric", "task"]).sort_index(kind="stable")["mean"]
-    drops = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").groupby(level=[0, 1]).mean()
-    one = of.xs("drop 50 cm", level="condition").xs("falls_per_minute", level="metric").max()
-    assert f"falls more than {drops.max():.1f} times a minute, one training of the combination {one:.1f} times" in text
-    peaks = of.xs("drop 50 cm", level="condition").xs("peak_force", level="metric")
-    recipe, tuned = (
-        peaks[trained_as(policy)] for policy in ("default torque, 20 ms, damping, history", "PD, 20 ms, tuned")
+    of = conditions.set_index(["trained", "task", "condition", "metric"]).sort_index(kind="stable")["mean"]
+    policies = [policy for policy, *_ in rows_of("results.md", "policy | undisturbed")[1]]
+    drops = [of[(*trained_as(policy), "drop 50 cm", "falls_per_minute")] for policy in policies]
+    assert f"falls more than {max(each.mean() for each in drops):.1f} times a minute" in text
+    most = max(each.max() for each in drops)
+    assert f"one training with a decaying bias {most:.1f} times." in text
+    assert most == of[late, "a1_decap", "drop 50 cm", "falls_per_minute"].max()
+    assert max(drops, key=lambda each: each.mean()) is drops[policies.index("decaying PD bias, 10 ms")]
+    tuned, *recipes = (
+        of[(*trained_as(policy), "drop 50 cm", "peak_force")] for policy in ("PD, 20 ms, tuned", RECIPE, MORE)
     )
-    assert f"{1 - recipe.mean() / tuned.mean():.0%} below tuned PD's (p = {welch(recipe, tuned):.3f})" in text
-    base = text_of("results.md", "- **Trained with ideal motors**")
-    ideal = of["ideal motors, no latency"].xs("track_percentage", level="metric")
-    mean = ideal.groupby(level=[0, 1]).mean().unstack(level=0)
-    assert (mean["real motors"] - mean["as trained"]).abs().max() < 0.0015 and len(ideal) == 45
-    lost = (mean["as trained"] - mean["real motors 10 ms"])[["a1_position", "a1_torque_multihead", "a1_torque"]]
-    assert "PD loses {:.3f}, torque multi-head {:.3f} and default torque {:.3f}".format(*lost) in base
-    sata = of[late, "as trained", "track_percentage", "a1_sata"]
-    assert f"{len(sata)} seeds track {sata.min():.2f} to {sata.max():.2f}".replace("3 seeds", "three seeds") in base
+    assert {f"{1 - each.mean() / tuned.mean():.0%}" for each in recipes} == {"4%"}
+    said = "is 4% below tuned PD's (p = {:.3f} and {:.3f})"
+    assert said.format(*(welch(each, tuned) for each in recipes)) in text
+    tuned, more = (of[(*trained_as(policy), "dead leg", "falls_per_minute")] for policy in ("PD, 20 ms, tuned", MORE))
+    assert f"history least (tuned PD: p = {welch(more, tuned):.3f})" in text
+    base = text_of("results.md", "- **SATA**")
+    sata = of[late, "a1_sata", "as trained", "track_percentage"]
+    assert f"seeds track {sata.min():.2f} to {sata.max():.2f}" in base and len(sata) == 3
+    pairs = [
+        [of[when, f"a1_{task}", "as trained", metric] for when in (f"{late} (former defaults)", late)]
+        for task, metric in (
+            ("torque_multihead", "track_percentage"),
+            ("torque", "cost_of_transport"),
+            ("variable_stiffness", "cost_of_transport"),
+        )
+    ]
+    (track, torque, stiffness), p = (
+        [[each.mean() for each in pair] for pair in pairs],
+        [p_text(*each) for each in pairs],
+    )
+    assert f"head {track[0]:.3f} of tracking instead of {track[1]:.3f} ({p[0]})" in base
+    assert f"of transport of {torque[0]:.2f} instead of {torque[1]:.2f} ({p[1]}) and" in base
+    assert f"stiffness {stiffness[0]:.2f} instead of {stiffness[1]:.2f} ({p[2]};" in base
 
 
 def test_repeated_trainings():
@@ -157,34 +162,39 @@ def test_repeated_trainings():
     assert said in text_of("results.md", "## What policies bear")
 
 
-def test_what_policies_bear(swept):
-    """What the sentences say: latency of seven approaches, pushes and payload of five, energy of two."""
+def test_what_policies_bear(swept, conditions):
+    """What the sentences say of seven approaches: latency, pushes, payload and friction; energy of two."""
     text, base = text_of("results.md", "## What policies bear"), swept.loc[BASE]
-    pushed = base.loc["push_velocity", "fell", 3.5].groupby("task").mean()
+    trained = conditions.query(f"trained == '{BASE}' and condition == 'as trained' and metric == 'track_percentage'")
+    trained = trained.set_index("task")["mean"]
+    ours, position = (trained[f"a1_{name}"] for name in ("torque_multihead", "position"))
+    said = f"torque multi-head tracks {ours.mean():.3f} and PD {position.mean():.3f} (p = {welch(ours, position):.2f}"
+    assert said in text
+    pushed = base.loc["push_velocity", "fell", 3.5]
     names = ("position", "torque", "torque_multihead", "torque_curriculum_multihead", "torque_curriculum")
+    names += ("variable_stiffness", "decap")
+    pushed = [pushed[f"a1_{name}"] for name in names]
     words = "{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
-    words += "the combination and {:.2f} under the curriculum"
-    assert words.format(*pushed[[f"a1_{name}" for name in names]]) in text
-    assert f"curriculum; {pushed['a1_variable_stiffness']:.2f} under variable stiffness." in text
-    both = pd.concat([swept.loc[trained, "push_velocity", "fell", 3.5] for trained in (BASE, f"{BASE} (earlier)")])
-    both = {name: both[f"a1_{name}"] for name in names}
-    p = dict(zip(names[1:], holm([welch(both[name], both["position"]) for name in names[1:]]), strict=True))
-    said = f"default torque falls less ({both['torque'].mean():.2f} against {both['position'].mean():.2f}, p = "
-    said += f"{p['torque']:.2f}), torque multi-head, too ({both['torque_multihead'].mean():.2f}, p = "
-    said += f"{p['torque_multihead']:.2f}), and the curriculum more ({both['torque_curriculum'].mean():.2f}, p = "
-    assert f"{said}{p['torque_curriculum']:.3f})." in text and {10} == {len(each) for each in both.values()}
+    words += (
+        "the combination and {:.2f} under the curriculum; {:.2f} under variable stiffness and {:.2f} under a decaying"
+    )
+    assert words.format(*(each.mean() for each in pushed)) in text
+    p = holm([welch(each, pushed[0]) for each in pushed[1:]])
+    said = f"from {pushed[0].min():.2f} to {pushed[0].max():.2f}, and no difference to PD is significant"
+    assert said in text and min(p) > 0.05 and f"; torque multi-head p = {p[1]:.2f})" in text
     late = base.loc["action_delay", "track_percentage", 6.0]
-    others = [f"a1_{name}" for name in names[1:]]
-    position, torque, decap = late["a1_position"], late[others], late["a1_decap"]
-    said = f"PD tracks {position.min():.2f} to {position.max():.2f}, variable stiffness "
-    stiffness = late["a1_variable_stiffness"]
-    assert f"{said}{stiffness.min():.2f} to {stiffness.max():.2f}, torque with" in text
-    assert f"PD bias {decap.min():.2f} to {decap.max():.2f}, and the other four" in text
-    assert f"approaches {torque.min():.2f} to {torque.max():.2f}. - **Pushes**" in text
+    ends = [late[f"a1_{name}"] for name in ("position", "variable_stiffness", "decap")]
+    ends.append(late[[f"a1_{name}" for name in names[1:5]]])
+    said = (
+        "PD tracks {} to {}, variable stiffness {} to {}, torque with a decaying PD bias {} to {}, and the other four "
+    )
+    said += "torque approaches {} to {}."
+    assert said.format(*(f"{end:.2f}" for each in ends for end in (each.min(), each.max()))) in text
     masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     costs = masses.iloc[0] - masses.iloc[-1]
-    low, high = costs[others].min(), costs[others].max()
-    assert f"costs PD {costs['a1_position']:.3f}" in text and f"these four {low:.3f} to {high:.3f}. From" in text
+    others = costs.drop("a1_position")
+    said = f"costs PD {costs['a1_position']:.3f} of tracking, the other six {others.min():.3f} to {others.max():.3f}."
+    assert said in text and len(others) == 6
     ends = []
     for steps in (0.0, 2.0):
         for task in ("a1_torque_multihead", "a1_position"):
