@@ -111,7 +111,7 @@ def test_table_of_conditions(conditions):
 
 
 def test_other_conditions(conditions):
-    """What is said of drops, a dead leg, former defaults and SATA; of the rest, stars of the table say it."""
+    """What is said of energy, drops, a dead leg, former defaults and SATA; of the rest, stars of the table say it."""
     text, late = text_of("results.md", "**Other conditions**"), "late by 0 to 10 ms"
     of = conditions.set_index(["trained", "task", "condition", "metric"]).sort_index(kind="stable")["mean"]
     policies = [policy for policy, *_ in rows_of("results.md", "policy | undisturbed")[1]]
@@ -129,6 +129,12 @@ def test_other_conditions(conditions):
     assert said.format(*(welch(each, tuned) for each in recipes)) in text
     tuned, more = (of[(*trained_as(policy), "dead leg", "falls_per_minute")] for policy in ("PD, 20 ms, tuned", MORE))
     assert f"history least (tuned PD: p = {welch(more, tuned):.3f})" in text
+    tuned, *recipes = (
+        of[(*trained_as(policy), "as trained", "cost_of_transport")] for policy in ("PD, 20 ms, tuned", RECIPE, MORE)
+    )
+    said = "of {:.2f} and {:.2f} as trained, PD of {:.2f} ".format(*(each.mean() for each in (*recipes, tuned)))
+    chances = " and ".join(p_text(each, tuned) for each in recipes)
+    assert f"{said}({chances})." in text_of("results.md", "- **Torque with damping and latency")
     base = text_of("results.md", "- **SATA**")
     sata = of[late, "a1_sata", "as trained", "track_percentage"]
     assert f"seeds track {sata.min():.2f} to {sata.max():.2f}" in base and len(sata) == 3
@@ -168,8 +174,12 @@ def test_what_policies_bear(swept, conditions):
     trained = conditions.query(f"trained == '{BASE}' and condition == 'as trained' and metric == 'track_percentage'")
     trained = trained.set_index("task")["mean"]
     ours, position = (trained[f"a1_{name}"] for name in ("torque_multihead", "position"))
-    said = f"torque multi-head tracks {ours.mean():.3f} and PD {position.mean():.3f} (p = {welch(ours, position):.2f}"
-    assert said in text
+    said = f"torque multi-head tracks {ours.mean():.3f} and PD {position.mean():.3f} (p = {welch(ours, position):.2f})"
+    ours, position = (
+        base.loc["action_delay", "track_percentage", 2.0, f"a1_{name}"] for name in ("torque_multihead", "position")
+    )
+    late = f"with actions 10 ms late {ours.mean():.3f} and {position.mean():.3f} ({p_text(ours, position)}, not"
+    assert f"{said}, {late} corrected)" in text
     pushed = base.loc["push_velocity", "fell", 3.5]
     names = ("position", "torque", "torque_multihead", "torque_curriculum_multihead", "torque_curriculum")
     names += ("variable_stiffness", "decap")
