@@ -10,7 +10,7 @@ from typing import Annotated, Any, BinaryIO
 
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, command_of, step_words
 from legged_torque.utils.devices import resolve_device
-from legged_torque.utils.distributed import ending_with_parent
+from legged_torque.utils.distributed import ending_with_parent, usable_cores
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Limits, check_value
 
@@ -62,7 +62,7 @@ class LocalLauncher:
         self._room = len(self._devices) * (jobs or (CPU_JOBS if first == "cpu" else GPU_JOBS))
         self.variables: dict[str, str] = {}
         if self._room > 1 and "OMP_NUM_THREADS" not in os.environ:  # steps share the cores
-            self.variables["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // self._room))
+            self.variables["OMP_NUM_THREADS"] = str(max(1, usable_cores() // self._room))
         self._running: list[LocalProcess] = []
 
     def room(self) -> int:

@@ -18,7 +18,7 @@ import legged_torque
 from legged_torque.experiments.local_launcher import LocalProcess
 from legged_torque.experiments.matrix import command_of
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.files import write_whole
+from legged_torque.utils.files import part_of, remove_stale_parts, write_whole
 from legged_torque.utils.runs import package_versions
 
 Files = dict[str, bytes]  # contents by path below the folder of the results
@@ -49,8 +49,9 @@ class NodeStep:
         gpus = ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
         place = f"{address} cuda:{gpus[0]}" if gpus else f"{address} {device}"
         check_versions(f"{address} ({socket.gethostname()})", versions, versions_here())
-        self._folder, self._reported_at = tempfile.TemporaryDirectory(prefix="legged_torque_"), time.monotonic()
-        root, self._sent = Path(self._folder.name), dict[str, Version]()
+        remove_stale_parts(Path(tempfile.gettempdir()))  # folders of steps whose actors were killed
+        self._folder = tempfile.TemporaryDirectory(prefix="legged_torque_", suffix=part_of(Path("_")).name)
+        root, self._sent, self._reported_at = Path(self._folder.name), dict[str, Version](), time.monotonic()
         write_files(root, files)
         new_files(root, self._sent)  # which the sender has
         with open(root / LOG, "wb") as output:

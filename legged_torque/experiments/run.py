@@ -36,9 +36,9 @@ class CountedStop(StopRequest):
     count = 0
 
     def _handle(self, number: int) -> None:
-        """Count a signal."""
+        """Count a signal, but once those of a terminal that closes."""
+        self.count += not (self.requested and number == signal.SIGHUP)
         self.requested, self.number = True, self.number or number
-        self.count += 1
 
 
 class ExperimentRun:

@@ -24,7 +24,8 @@ MAX_PROCESSES = 8  # that this module starts: each holds 0.7 GB of memory
 _END_WITH_PARENT = f"""
 import ctypes, os, sys
 ctypes.CDLL(None).prctl(1, {int(signal.SIGTERM)}, 0, 0, 0)  # PR_SET_PDEATHSIG of linux/prctl.h
-os.execvp(sys.argv[1], sys.argv[1:])
+if os.getppid() == int(sys.argv[1]):  # else it has ended before
+    os.execvp(sys.argv[2], sys.argv[2:])
 """
 _PARENT = os.getppid()  # torchrun or the first process, if it has started this one
 _POLL = 0.2  # seconds between looks at the processes that this one waits for
@@ -71,7 +72,9 @@ def ending_with_parent(command: list[str]) -> list[str]:
     Only Linux can do so; elsewhere the command is returned unchanged. ``preexec_fn`` of Popen would save one start of
     Python, but is not safe in a process with threads, such as a training.
     """
-    return [sys.executable, "-I", "-c", _END_WITH_PARENT, *command] if sys.platform == "linux" else command
+    if sys.platform != "linux":
+        return command
+    return [sys.executable, "-I", "-c", _END_WITH_PARENT, str(os.getpid()), *command]
 
 
 def use_cores(num_processes: int) -> bool:

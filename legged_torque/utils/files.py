@@ -168,5 +168,5 @@ def without_machine(value: Any) -> Any:
         return [without_machine(entry) for entry in value]
     if not isinstance(value, str):
         return value
-    key, equals, path = value.rpartition("=")
+    key, equals, path = ("", "", value) if Path(value).is_absolute() else value.partition("=")
     return key + equals + portable_path(path) if Path(path).is_absolute() else value

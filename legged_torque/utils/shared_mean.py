@@ -36,7 +36,8 @@ class SharedMean:
         self._rows: dict[int, Tensor] = {}  # by how many numbers are averaged. Shapes: (2, world_size, numbers)
         self._turns: dict[int, int] = {}
         if rank == 0:
-            self._others: list[Connection] = [_listeners[0].accept() for _ in range(1, world_size)]
+            with _listeners.pop() as listener:  # at whose end the file of its socket is removed
+                self._others: list[Connection] = [listener.accept() for _ in range(1, world_size)]
         else:
             self._others = [Client(self._address, authkey=bytes.fromhex(os.environ[_KEY]))]
 

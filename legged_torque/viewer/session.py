@@ -281,8 +281,6 @@ class Session:
         cfg = copy.deepcopy(self._run.env_cfg)
         if name != AS_LOADED:
             apply_perturbation(cfg, name)
-        if self.companion:
-            self.companion.set_perturbation(name)
         self.message = Message(f"building the worlds with perturbation '{name}' ...")
         old = self.task
         task = self._make_task(cfg)
@@ -293,6 +291,8 @@ class Session:
             task.terrain.columns.copy_(old.terrain.columns)
         self.perturbation = name
         self._adopt(task)
+        if self.companion:
+            self.companion.set_perturbation(name)
         self.message = Message(f"perturbation '{name}'")
 
     # ---- checkpoints -------------------------------------------------------------------------------------------------

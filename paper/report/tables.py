@@ -77,9 +77,11 @@ def verdict(metric: Metric, found: dict[str, Any], paper: float) -> str:
 
 
 def welch(first: list[float], second: list[float]) -> float:
-    """Return the two-sided p value of Welch's t-test; NaN with fewer than two values on a side, or no variance."""
-    if min(len(first), len(second)) < 2 or np.ptp(first) == np.ptp(second) == 0.0:
+    """Return the two-sided p value of Welch's t-test; NaN with fewer than two values on a side, or if all are equal."""
+    if min(len(first), len(second)) < 2 or np.ptp([*first, *second]) == 0.0:
         return np.nan
+    if np.ptp(first) == np.ptp(second) == 0.0:
+        return 0.0  # its limit
     return float(stats.ttest_ind(first, second, equal_var=False).pvalue)
 
 

@@ -39,7 +39,8 @@ def find_trainings(folder: Path, problems: list[str]) -> Trainings:
     """
     keys: dict[Path, tuple[str, str, int]] = {}
     configs: dict[Path, dict[str, Any]] = {}
-    for run in sorted({file.parent for file in folder.rglob(CONFIG_FILE)}, key=lambda path: (path.name, path)):
+    found = {file.parent for file in folder.rglob(CONFIG_FILE) if file.parent.suffix != ".part"}
+    for run in sorted(found, key=lambda path: (path.name, path)):
         try:
             config = load_config(run)
             train = config["train"]

@@ -164,6 +164,14 @@ def test_nobody_reads(stage, tmp_path, monkeypatch):
     assert trained(stage) == ["a1_position-low-s1"]
 
 
+def test_a_terminal_that_closes():
+    """It may send its signal twice, which is one request; a second one of another kind counts."""
+    with experiment_run.CountedStop() as stop:
+        for number, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGTERM, 2)):
+            os.kill(os.getpid(), number)
+            assert stop.count == count
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stop(stage, tmp_path, number):
     """Trainings save before this process ends with the status of the signal, and go on the next time."""
@@ -308,7 +316,8 @@ def places(stage, tmp_path, monkeypatch):
     (stage / "evaluate.py").write_text(shown + "\nwhile not os.path.exists('ended'): pass")
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    monkeypatch.setattr(os, "cpu_count", lambda: 12)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(12)), raising=False)
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)  # of which others have the rest
     monkeypatch.chdir(tmp_path)
     matrix = read_matrix(write(tmp_path / "m.yaml", SMALL))
 

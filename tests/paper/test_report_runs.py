@@ -1,5 +1,7 @@
 """Reports on runs of train.py without a plan."""
 
+import shutil
+
 import pytest
 from support.reports import Page, line, run_report, whole_run, write_grounds, write_run
 
@@ -51,6 +53,7 @@ def logs(tmp_path):
     write_run(resumed, whole_run(0.7)[1:], settings("mine", 1, "low", run_name="wide"))
     (tmp_path / "logs" / "bad").mkdir()
     (tmp_path / "logs" / "bad" / "config.yaml").write_text("walk")
+    shutil.copytree(resumed, tmp_path / "logs" / "mine" / "2026-01-09_00-00-00.host.7.part")  # which is just being made
     return tmp_path / "logs"
 
 

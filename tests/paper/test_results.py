@@ -100,7 +100,8 @@ def test_welch_by_hand():
     assert welch([1, 2, 3], [3, 5, 7]) == pytest.approx(2.0 * stats.t.cdf(-3.0 / math.sqrt(5 / 3), 50 / 17))
     assert welch([1, 2, 3], [3, 5, 7]) == welch([3, 5, 7], [1, 2, 3])
     assert welch([1, 2], [1, 2]) == 1.0
-    assert all(math.isnan(welch(*pair)) for pair in (([1], [1, 2]), ([], [1, 2]), ([1, 1], [2, 2])))
+    assert all(math.isnan(welch(*pair)) for pair in (([1], [1, 2]), ([], [1, 2]), ([1, 1], [1, 1])))
+    assert welch([1, 1], [2, 2]) == 0.0  # as shares of 0 and 1
 
 
 def test_holm_by_hand():

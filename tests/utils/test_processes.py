@@ -1,7 +1,11 @@
 """Processes that torchrun has started, or should have, without the others, and means over such processes."""
 
+import os
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
@@ -69,6 +73,14 @@ def test_processes_with_other_settings(second_of_two):
     distributed.check_same({"task": "t", "weight": float("nan")})
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends processes with their parent")
+def test_a_parent_that_is_killed_at_once():
+    """What it was about to start is not started, although it could not yet ask to end with it."""
+    program = "import os, subprocess; from legged_torque.utils.distributed import ending_with_parent\n"
+    program += "subprocess.Popen(ending_with_parent(['sh', '-c', 'echo started; sleep 9'])); os.kill(os.getpid(), 9)"
+    assert subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, timeout=60).stdout == b""
+
+
 RANKS, ROUNDS = 3, 30
 
 
@@ -83,10 +95,12 @@ def test_means(monkeypatch):
     for name in (shared_mean.ADDRESS, shared_mean._KEY):
         monkeypatch.setenv(name, "")  # put back afterwards
     shared_mean.listen()
-    results, lost = {}, []
+    results, lost, listens = {}, [], [Path(os.environ[shared_mean.ADDRESS]).exists()]
 
     def run(rank):
         mean = shared_mean.SharedMean(rank, RANKS)
+        if rank == 0:  # all are there
+            listens.append(Path(mean._address).exists())
         for number in range(ROUNDS):
             time.sleep(0.003 * np.random.default_rng([rank, number, 1]).random())
             results[rank, number] = mean.average(torch.tensor(numbers(rank, number))).numpy()
@@ -105,6 +119,7 @@ def test_means(monkeypatch):
         thread.start()
     for thread in threads:
         thread.join(timeout=30)
+    assert listens == [True, False]  # is there a file of the socket?
     for number in range(ROUNDS):
         expected = np.mean([numbers(rank, number) for rank in range(RANKS)], axis=0)
         for rank in range(RANKS):

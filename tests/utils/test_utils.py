@@ -106,6 +106,7 @@ def test_without_machine(monkeypatch, tmp_path):
     settings = {"file": "/tmp/a.pt", "scale": 0.5, "names": ["a/b", "runner.file=/tmp/b.pt", "x=1/2", None]}
     expected = {"file": "a.pt", "scale": 0.5, "names": ["a/b", "runner.file=b.pt", "x=1/2", None]}
     assert without_machine(settings) == expected
+    assert without_machine(["/home/me/lr=1/c.pt", "file=/home/me/lr=1/c.pt"]) == ["c.pt", "file=c.pt"]
 
 
 PROGRAM = """import time

@@ -3,6 +3,7 @@
 import math
 import shutil
 import threading
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from support.clock import Clock, wait_for
 from support.sessions import new_session, tilted
 
 from legged_torque.learning.memory import acting
+from legged_torque.utils.errors import UserError
 from legged_torque.viewer import session as session_module
 from legged_torque.viewer.pacing import MAX_LAG, Pacer
 from legged_torque.viewer.session import AS_LOADED, SCAN_INTERVAL
@@ -155,7 +157,7 @@ def test_mixing(make_session):
     assert session.task.mixing[0] > trained[0] and session.chosen_mixing is None  # checkpoint 0 is an earlier one
 
 
-def test_companion(make_session):
+def test_companion(make_session, monkeypatch):
     """Another policy walks with the first one: step by step, under its command, pushed and reset with it."""
     session, _ = make_session("a1_torque", **{"commands.resampling_probability": 0.5})
     other = session.companion = make_session("a1_position")[0]
@@ -175,6 +177,9 @@ def test_companion(make_session):
     other.load_checkpoint(0)
     session.tick()
     assert other.checkpoint == 0 and session.checkpoint == 1
+    monkeypatch.setattr(session, "_make_task", Mock(side_effect=UserError("no room")))
+    ask(session.set_perturbation, "high", count=2)
+    assert session.perturbation == other.perturbation == AS_LOADED and "no room" in session.message.text
 
 
 def test_checkpoints(make_session, tmp_path):
