@@ -30,7 +30,7 @@ from legged_torque.utils.devices import choose_offscreen_renderer, resolve_devic
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import Count, Limits
-from legged_torque.utils.metrics import UNITS
+from legged_torque.utils.metrics import UNITS, hide_nan
 from legged_torque.utils.options import DEFAULT_TASK
 from legged_torque.utils.task_registry import LOGS, LoadedRun, experiment_dir, set_seed
 
@@ -211,7 +211,7 @@ def roll_out(
     metrics = measure(env, policy, args.steps, lambda commands: recorder.add_step() if recorder else None)
     print(f"{title}:")
     for name, value in metrics.means().items():
-        print(f"  {name:<18} {value:8.4f} {UNITS[name]}")
+        print(hide_nan(f"  {name:<18} {value:8.4f} {UNITS[name]}"))
     return recorder is not None and recorder.save(args.video or video, args.no_renderer) and not args.video
 
 

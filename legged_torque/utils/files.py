@@ -23,7 +23,9 @@ def importable(file: Path, option: str) -> str:
     A UserError says why the file, which was given as an ``option``, cannot be imported.
     """
     name, path = file.stem, file.absolute()
-    if not path.is_file() or path.suffix != ".py" or not name.isidentifier():
+    if not path.is_file():
+        raise UserError(f"{option}: there is no file '{file}'")
+    if path.suffix != ".py" or not name.isidentifier():
         raise UserError(f"{option} takes a Python file with the name of a module, not '{file}'")
     if name in sys.modules:
         other = getattr(sys.modules[name], "__file__", None) or name  # Python's own have none

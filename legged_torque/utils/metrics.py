@@ -60,7 +60,8 @@ class Estimate:
 
 def hide_nan(line: str) -> str:
     """Return a line of results with - for what was not measured, and without standard errors of a single world."""
-    return line.replace("nan +- nan", f"{'-':>12}").replace(" +- nan", "")  # means are wider than NaN by two
+    line = line.replace("nan +- nan", f"{'-':>12}")  # means are wider than NaN by two
+    return line.replace(" +- nan", "").replace(" nan", "   -")
 
 
 def tracking_percentage(xp: ModuleType, error: Array, commands: Array) -> tuple[Array, Array]:
@@ -154,7 +155,7 @@ def estimates(of: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Esti
 
 def estimate(numerator: np.ndarray, denominator: np.ndarray) -> Estimate:
     """Return a ratio of sums over worlds with its standard error, which takes worlds as independent (delta method)."""
-    total, count = denominator.sum(), len(numerator)
+    total, count = denominator.sum(), np.count_nonzero(np.logical_or(numerator, denominator))  # of those that took part
     if total == 0.0:
         return Estimate(math.nan, math.nan)
     mean = numerator.sum() / total

@@ -231,8 +231,10 @@ def test_robot_at_the_other_end(make_task, exported_go2, tmp_path, monkeypatch):
     assert_told_in_one_line(run_here(*own, "--robot=a1", root=tmp_path), "--robot must be 'go2'")
     assert_told_in_one_line(run_here(*own, "--domain=1", root=tmp_path), "FILE.py:CLASS do without")
     (tmp_path / "queue.py").write_text(OWN)
+    (tmp_path / "no-robot.py").write_text(OWN)
     named, other = "takes a Python file with the name of a module", "there is another module 'queue'"
-    wrong = {"own_robot.py:Yours": "no class 'Yours'", "no_robot.py:Mine": named, "queue.py:Mine": other}
+    wrong = {"own_robot.py:Yours": "no class 'Yours'", "no-robot.py:Mine": named, "queue.py:Mine": other}
+    wrong["no_robot.py:Mine"] = "there is no file 'no_robot.py'"
     kinds = "must have joint_order, names, and as many torque_limits, numbers"
     wrong |= dict.fromkeys((f"own_robot.py:{name}" for name in ("Older", "Numbered", "Written", "Short")), kinds)
     wrong |= {"own_robot.py:Addressed": "made without arguments"}

@@ -126,7 +126,7 @@ def test_what_the_preset_for_cpus_replaces(task, kept, tmp_path, capsys):
         ("import sys\nsys.exit()\n", "'theirs.py' cannot be imported: line 2 of 'theirs.py': SystemExit"),
         ("raise GeneratorExit\n", "'theirs.py' cannot be imported: line 1 of 'theirs.py': GeneratorExit"),
         (REGISTER.format("x").replace("'x'", "5"), "'theirs.py': the name of a task must be a text"),
-        (None, "--task_file takes a Python file with the name of a module, not 'theirs.py'"),
+        (None, "--task_file: there is no file 'theirs.py'"),
     ],
 )
 def test_files_of_no_use(text, told, tmp_path):
