@@ -10,7 +10,7 @@ from support.control import CONVERGED, WEIGHT, contacts_by_hand, pd_by_hand
 from support.settings import torques_in_torch
 
 from legged_torque.envs.base.metrics import CommandBreakdown, WalkingMetrics, measure
-from legged_torque.utils.metrics import UNITS, estimate, step_sums
+from legged_torque.utils.metrics import UNITS, estimate, hide_nan, step_sums
 
 STATE = ("qpos", "qvel", "qacc_warmstart")
 RANGES = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-2.0, 0.0], "ang_vel_yaw": [0.5, 2.5]}
@@ -149,6 +149,13 @@ def test_tracking_of_headings_by_hand(make_task):
     assert metrics.means()["track_percentage"] == pytest.approx(0.5)
 
 
+def test_lines_of_results():
+    """What was not measured is "-", and one world has no standard error."""
+    lines = {"height     nan +- nan m": "height                - m", "height  1.000 +- nan m": "height  1.000 m"}
+    lines |= {"peak_force      nan N": "peak_force        - N", "height  1.000 +- 0.100 m": "height  1.000 +- 0.100 m"}
+    assert {line: hide_nan(line) for line in lines} == lines
+
+
 def test_standard_error_by_hand():
     """A ratio of sums with its standard error, which is unknown with one world."""
     result = estimate(np.array([2.0, 0.0, 4.0]), np.array([1.0, 2.0, 3.0]))  # residuals 1, -2, 1
@@ -250,8 +257,8 @@ def test_breakdown_by_hand(task):
         columns = [[part[key] for key in ("from", "to", "share", "track_percentage", "error")] for part in parts]
         assert np.array(columns) == pytest.approx(np.array(expected[name]), abs=1e-6)
         assert sum(part["share"] for part in parts) == pytest.approx(1.0, abs=1e-9)
-    # two worlds are in the first part of x for two steps each: their errors of 1.0 and 0.0 in all differ by 0.5 from the
-    # 2 x 0.25 of the mean; one is in the others
+    # two worlds are in the first part of x for two steps each: their errors of 1.0 and 0.0 in all differ by 0.5 from
+    # the 2 x 0.25 of the mean; one is in each of the others
     errors = [part["error_standard_error"] for part in table["lin_vel_x"]]
     assert errors == pytest.approx([np.sqrt(2 * 0.5**2 * 2 / 1) / 4, np.nan, np.nan], nan_ok=True)
 

@@ -197,7 +197,6 @@ def test_train_stop_resume_play(tmp_path):
     assert f"model_{count + 2}.pt, after {(count + 2) * 8:,} steps of training:" in output
     for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
         assert math.isfinite(float(re.search(rf"^\s*{name}\s+(\S+)", output, re.MULTILINE).group(1)))
-    assert re.search(r"^  peak_force +- N$", output, re.MULTILINE)  # no episode has ended
     assert re.match(r"no video: .+", output.splitlines()[-1])  # see test_packaging.py for one
 
 
