@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2162,
     "paper": 3243,
     "tools": 1484,
-    "tests": 27534,
+    "tests": 27533,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 33_399  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder

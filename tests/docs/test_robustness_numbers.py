@@ -185,9 +185,8 @@ def test_what_policies_bear(swept, conditions):
     names += ("variable_stiffness", "decap")
     pushed = [pushed[f"a1_{name}"] for name in names]
     words = "{:.2f} of the robots under PD, {:.2f} under default torque, {:.2f} under torque multi-head, {:.2f} under "
-    words += (
-        "the combination and {:.2f} under the curriculum; {:.2f} under variable stiffness and {:.2f} under a decaying"
-    )
+    words += "the combination and {:.2f} under the curriculum; {:.2f} under variable stiffness and {:.2f} under a "
+    words += "decaying bias."
     assert words.format(*(each.mean() for each in pushed)) in text
     p = holm([welch(each, pushed[0]) for each in pushed[1:]])
     said = f"from {pushed[0].min():.2f} to {pushed[0].max():.2f}, and no difference to PD is significant"
@@ -195,10 +194,8 @@ def test_what_policies_bear(swept, conditions):
     late = base.loc["action_delay", "track_percentage", 6.0]
     ends = [late[f"a1_{name}"] for name in ("position", "variable_stiffness", "decap")]
     ends.append(late[[f"a1_{name}" for name in names[1:5]]])
-    said = (
-        "PD tracks {} to {}, variable stiffness {} to {}, torque with a decaying PD bias {} to {}, and the other four "
-    )
-    said += "torque approaches {} to {}."
+    said = "PD tracks {} to {}, variable stiffness {} to {}, torque with a decaying PD bias {} to {}, and the other "
+    said += "four torque approaches {} to {}."
     assert said.format(*(f"{end:.2f}" for each in ends for end in (each.min(), each.max()))) in text
     masses = base.loc["trunk_mass", "track_percentage"].groupby(["from", "task"]).mean().unstack()
     costs = masses.iloc[0] - masses.iloc[-1]

@@ -76,7 +76,7 @@ def test_a_cell_that_fails_does_not_stop_the_others(stage, tmp_path):
 
 
 def test_a_lock_that_cannot_be_taken_fails_its_cell_only(stage, tmp_path):
-    """What is wrong is told in one line."""
+    """The reason is one line, and the other cell is done."""
     file, out = write(tmp_path / "m.yaml", SMALL), tmp_path / "out"
     (out / "a1_position-low-s1" / "lock").mkdir(parents=True)
     status, output, error = experiment_here(file, f"--out={out}", "--device=cpu", tmp_path=tmp_path)
@@ -167,11 +167,13 @@ def test_nobody_reads(stage, tmp_path, monkeypatch):
 def test_a_terminal_that_closes():
     """It may send its signal twice, which is one request; a second one of another kind counts."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup it would be ignored
-    with experiment_run.CountedStop() as stop:
-        for number, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGTERM, 2)):
-            os.kill(os.getpid(), number)
-            assert stop.count == count
-    signal.signal(signal.SIGHUP, before)
+    try:
+        with experiment_run.CountedStop() as stop:
+            for number, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGTERM, 2)):
+                os.kill(os.getpid(), number)
+                assert stop.count == count
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
