@@ -35,10 +35,12 @@ from legged_torque.deploy.policy import (
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.motors.delay import ActionDelay
+from legged_torque.motors.models import ModelMotor
 from legged_torque.motors.motor import Motor
 from legged_torque.motors.twin import MotorTwin
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.terrain.layout import Layout
+from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError, refuse, require
 from legged_torque.utils.files import write_errors
 from legged_torque.utils.policies import sha256
@@ -134,9 +136,12 @@ def network_problems(task: LeggedRobot, model: MLPModel) -> list[str]:
 
 def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
     """Return a line for each part of a task that only the task can compute, apart from observations."""
-    inherited = {name: link for name, link in task.motors.links.items() if type(link).describe is Motor.describe}
-    silent = [name for name, link in inherited.items() if not link.describe()]  # they may do anything
-    return parts_without_function(description) + [f"the motor '{name}' has no describe()" for name in silent]
+    ours = (Motor.describe, ModelMotor.describe)
+    inherited = {name: link for name, link in task.motors.links.items() if type(link).describe in ours}
+    problems = [f"the motor '{name}' has no describe()" for name, link in inherited.items() if not link.describe()]
+    if task.terrain.map and not isinstance(task.terrain, RoughGround):
+        problems.append(f"the ground {type(task.terrain).__name__} is not described")
+    return parts_without_function(description) + problems
 
 
 def export_note(task: LeggedRobot, model: MLPModel) -> str:

@@ -10,6 +10,7 @@ from legged_torque.motors.config import MotorCfg, check_single
 from legged_torque.motors.kernel import Part, TorqueKernel, joint_torque, newest_actions
 from legged_torque.motors.motor import Joints, Motor
 from legged_torque.sim.randomization import RandomParameter
+from legged_torque.utils.buffers import check_tensor
 from legged_torque.utils.errors import UserError, check_names
 
 
@@ -37,7 +38,11 @@ class MotorChain:
             if name in self.links:
                 raise UserError(f"motors.chain has the link '{name}' twice; give the second one a section of its own")
             own = dataclasses.replace(joints, section=f"motors.{name}")
-            self.links[name] = getattr(settings, name).build(own)
+            self.links[name] = link = getattr(settings, name).build(own)
+            if not isinstance(link, Motor):
+                raise UserError(f"motors.{name}.build must return a Motor, not {link}")
+            check_names(f"acts_on of {type(link).__name__}", [link.acts_on], ("actions", "torques", "measurements"))
+            link.hold_tensors()
         self._of_actions, self._behind_law = (
             [link for link in self.links.values() if (link.acts_on == "actions") == early] for early in (True, False)
         )
@@ -65,7 +70,7 @@ class MotorChain:
         """Return the actions that have reached the motors by a physics step. Shape: (num_envs, num_actions)."""
         actions = self._actions
         for link in self._of_actions:
-            actions = link.apply(actions, pos, vel, substep)
+            actions = _applied(link, actions, pos, vel, substep)
         return actions
 
     def measured(self, pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,7 +90,7 @@ class MotorChain:
             if link is self.encoder:
                 state = pos, vel
             else:
-                torques = link.apply(torques, *state, substep)
+                torques = _applied(link, torques, *state, substep)
         return torques
 
     def before_friction(self, torques: Tensor) -> Tensor:
@@ -129,3 +134,10 @@ class MotorChain:
         """Return the tensors that must be finite in every world. Shapes: (num_envs, any)."""
         states = ((name, link.state_dict()) for name, link in self.links.items())
         return {f"{name}.{key}": value.flatten(1) for name, state in states for key, value in state.items()}
+
+
+def _applied(link: Motor, values: Tensor, pos: Tensor, vel: Tensor, substep: int) -> Tensor:
+    """Return what a link makes of torques or actions; a UserError if it has another shape."""
+    result = link.apply(values, pos, vel, substep)
+    check_tensor(f"what {type(link).__name__}.apply returns", result, values.shape, values.device)
+    return result

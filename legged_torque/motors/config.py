@@ -17,6 +17,8 @@ class MotorCfg(Section):
 
     def build(self, joints: Any) -> Any:
         """Return the :class:`~legged_torque.motors.motor.Motor` of :class:`~legged_torque.motors.motor.Joints`."""
+        if not self._motor_class:
+            raise UserError(f"{type(self).__name__} has no build")
         return pkgutil.resolve_name(self._motor_class)(self, joints)
 
     def describe(self) -> dict[str, Any]:

@@ -217,6 +217,9 @@ KERNELS = {
 class ModelMotor(Motor):
     """A link that computes a formula, in torch and in the kernel.
 
+    A user's subclass may change the formula: it runs in torch, unless it names its :attr:`kernel`, and exports know it
+    by a ``describe`` of its own.
+
     Attributes:
         values: Constants, state and numbers of the robot by name, see :mod:`legged_torque.motors.formulas`.
     """
@@ -226,7 +229,9 @@ class ModelMotor(Motor):
     def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
         """Lay out the constants, with a row per world for those that are drawn. Errors as of ``cfg.constants``."""
         super().__init__(cfg, joints)
-        self.formula, self.kernel = FORMULAS[cfg._model], KERNELS.get(cfg._model)  # type: ignore[misc]
+        self.formula = FORMULAS[cfg._model]
+        if self._is_ours():
+            self.kernel = KERNELS.get(cfg._model)  # type: ignore[misc]
         self.values = SimpleNamespace(dt=joints.dt, decimation=joints.decimation, nominal_pose=joints.nominal_pose)
         self.values.lowest_torque, self.values.highest_torque = joints.torque_limits
         self.values.p_gains, self.values.d_gains = joints.gains
@@ -253,6 +258,14 @@ class ModelMotor(Motor):
         """Write new state in place."""
         for name, values in state.items():
             self._buffers[name].copy_(values)
+
+    def _is_ours(self) -> bool:
+        """Return whether the class is one of this module, not a user's."""
+        return type(self).__module__ == __name__
+
+    def describe(self) -> dict[str, Any]:
+        """Return the constants of the link, which do not describe a user's subclass."""
+        return super().describe() if self._is_ours() else {}
 
     def kernel_reads(self) -> Any:
         """Return those of :attr:`values` that the kernel reads."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from legged_torque.motors.config import MotorCfg, by_joint
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.buffers import Buffers
+from legged_torque.utils.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -85,11 +86,11 @@ class Motor(Buffers):
             vel: Joint velocities [rad/s].
             substep: Number of the physics step within the control step.
         """
-        raise NotImplementedError(f"{type(self).__name__} has no apply")
+        raise UserError(f"{type(self).__name__} has no apply")
 
     def kernel_reads(self) -> Any:
         """Return what :attr:`kernel` reads: an instance of the Warp struct of its first parameter."""
-        raise NotImplementedError(f"{type(self).__name__} names a kernel without kernel_reads")
+        raise UserError(f"{type(self).__name__} names a kernel without kernel_reads")
 
     def reset(self, mask: Tensor) -> None:
         """Forget what belongs to episodes that have ended. Shape: (num_envs,), bool."""

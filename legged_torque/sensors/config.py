@@ -3,6 +3,7 @@
 from typing import Annotated, Any
 
 from legged_torque.utils.config import Section
+from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Limits, NotNegative
 
 
@@ -15,4 +16,4 @@ class SensorCfg(Section):
 
     def build(self, state: Any) -> Any:
         """Return the :class:`~legged_torque.sensors.sensor.Sensor` for a robot's state."""
-        raise NotImplementedError(f"{type(self).__name__} has no build")
+        raise UserError(f"{type(self).__name__} has no build")

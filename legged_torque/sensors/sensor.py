@@ -5,7 +5,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.state import RobotState
 from legged_torque.sensors.config import SensorCfg
-from legged_torque.utils.buffers import Buffers
+from legged_torque.utils.buffers import Buffers, check_tensor
 from legged_torque.utils.errors import UserError
 
 
@@ -44,11 +44,11 @@ class Sensor(Buffers):
 
     def shape(self) -> tuple[int, ...]:
         """Return the shape of a world's measurement."""
-        raise NotImplementedError(f"{type(self).__name__} has no shape")
+        raise UserError(f"{type(self).__name__} has no shape")
 
     def measure(self) -> Tensor:
         """Return a measurement of this moment, without delay and errors. Shape: (num_envs, *shape())."""
-        raise NotImplementedError(f"{type(self).__name__} has no measure")
+        raise UserError(f"{type(self).__name__} has no measure")
 
     def update(self, is_new: Tensor) -> None:
         """Measure, where and when it is time, once per control step.
@@ -57,8 +57,7 @@ class Sensor(Buffers):
         measurement has another shape. Shape: (num_envs,), bool.
         """
         now, new = self.measure(), is_new.view(-1, *[1] * len(self.shape()))
-        if (given := tuple(now.shape)) != (wanted := tuple(self.newest.shape)):
-            raise UserError(f"{type(self).__name__}.measure returns the shape {given}, not {wanted}")
+        check_tensor(f"what {type(self).__name__}.measure returns", now, self.newest.shape, self.device)
         if self.has_noise and self.cfg.noise:
             now = now + self.cfg.noise * (2.0 * torch.rand_like(now) - 1.0)
         if self.interval > 1:

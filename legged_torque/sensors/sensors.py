@@ -40,6 +40,7 @@ class Sensors(dict[str, Sensor]):
             self["height_scan"] = self.height_scan
         for sensor in self.values():
             sensor.has_noise = cfg.noise.add_noise
+            sensor.hold_tensors()
         sensing = Sensing(cfg.sensing.delay, state, motors, cfg.sim.dt, cfg.control.decimation)
         self.sensing = sensing if sensing.queue.is_needed or motors.encoder else None
         self._is_late = bool(self.sensing) and sensing.queue.is_needed

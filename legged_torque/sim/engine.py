@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.buffers import check_tensor
+from legged_torque.utils.errors import UserError, check_names
 
 CAPABILITIES = {
     "height_map": "takes ground that is not a plane as a HeightMap, not as a hfield in its model",
@@ -138,14 +139,7 @@ class Engine(Protocol):
 
 def check_mask(engine: Engine, mask: Tensor) -> None:
     """Raise a UserError unless a mask of worlds fits an engine: a kernel would read memory that is none of it."""
-    expected = (torch.bool, (engine.num_envs,), torch.device(engine.device))
-    given = (mask.dtype, tuple(mask.shape), mask.device)
-    if given != expected:
-        words = [
-            "{} {} on {}".format(str(dtype).removeprefix("torch."), shape, place)
-            for dtype, shape, place in (given, expected)
-        ]
-        raise UserError(f"a mask of worlds is {words[0]}; it must be {words[1]}")
+    check_tensor("a mask of worlds", mask, (engine.num_envs,), engine.device, torch.bool)
 
 
 def lacks(engine: Engine | type[Engine], capability: str, what: str = "this") -> UserError:
@@ -160,6 +154,8 @@ def require(engine: Engine | type[Engine], capability: str, what: str) -> None:
 
 
 def shared_field(engine: Engine, name: str, columns: Sequence[int] | None = None) -> Tensor:
-    """Return a copy of a field of the model that all worlds share. Shape: (1, ...)."""
-    owner = engine.mj_model.opt if name == "gravity" else engine.mj_model
+    """Return a copy of a field of the model that all worlds share; a UserError if there is none. Shape: (1, ...)."""
+    owner: Any = engine.mj_model.opt if name == "gravity" else engine.mj_model
+    known = [field for field in dir(owner) if isinstance(getattr(owner, field), np.ndarray)]
+    check_names("field of MuJoCo's model", [name], known)
     return torch.tensor(getattr(owner, name), dtype=torch.float32, device=engine.device).unsqueeze(0)

@@ -135,12 +135,17 @@ class Randomization:
 
     def _field(self, parameter: RandomParameter, model_field: Callable[[str, Sequence[int]], Tensor]) -> Tensor:
         """Return and keep the tensor of a parameter; a UserError unless the kernel can write to its addresses."""
-        name, field = parameter.name, parameter.field
+        name, field, columns = parameter.name, parameter.field, list(parameter.columns)
         if isinstance(field, str):
-            name, field = field, model_field(field, parameter.columns).flatten(1)
+            name, field = field, model_field(field, ()).flatten(1)
         kind, shape = field.dtype, tuple(field.shape)
         if kind != torch.float32 or len(shape) != 2:
             raise UserError(f"random parameter '{parameter.name}' must be float32 with two axes, not {kind} {shape}")
+        if not columns or len({*columns}) < len(columns) or not {*columns} <= {*range(shape[1])}:
+            allowed = f"different numbers from 0 to {shape[1] - 1}, one or more"
+            raise UserError(f"the columns of random parameter '{parameter.name}' must be {allowed}, not {columns}")
+        if isinstance(parameter.field, str):
+            model_field(name, columns)
         self.fields[name] = field
         return field
 
@@ -176,7 +181,12 @@ def table(parameter: RandomParameter, field: Tensor, keep_probability: float) ->
     draw = {"scale": (1.0, 1.0), "scale_per_joint": (1.0, 1.0), **parameter.draw}
     offset, scale = draw.get("set", draw.get("add", (0.0, 0.0))), draw["scale"]
     lowest, highest = parameter.limits or (-math.inf, math.inf)
-    columns = [np.broadcast_to(numbers, len(at_start)).tolist() for numbers in (own, unit, lowest, highest)]
+    given = {"own": own, "set_unit or add_unit": unit, "limits[0]": lowest, "limits[1]": highest}
+    for name, numbers in given.items():
+        if np.shape(numbers) not in ((), (len(at_start),)):
+            what = f"{name} of random parameter '{parameter.name}'"
+            raise UserError(f"{what} must be one number or {len(at_start)}, one per column, not {numbers}")
+    columns = [np.broadcast_to(numbers, len(at_start)).tolist() for numbers in given.values()]
     rows = []
     for default, base, weight, low, high in zip(at_start, *columns, strict=True):
         row: Any = kernels.RandomNumber()

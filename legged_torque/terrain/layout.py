@@ -97,7 +97,7 @@ class Layout:
     def tile(self, row: int, col: int) -> np.ndarray:
         """Return the heights of one tile [m]; its random numbers are its own. Shape: as of a TileFunction."""
         kind, grid = self.kinds()[col], Grid(self._tile, self.horizontal_scale)
-        heights = TILES[kind](self.difficulty(row), np.random.default_rng([self.seed, row, col]), grid)
+        heights = np.asarray(TILES[kind](self.difficulty(row), np.random.default_rng([self.seed, row, col]), grid))
         if heights.shape != grid.flat().shape or not np.isfinite(heights).all():
             raise UserError(f"the kind of tile '{kind}' must return finite heights of shape {grid.flat().shape}")
         return heights

@@ -36,7 +36,9 @@ def select_tiles(settings: Any, kinds: Sequence[str], levels: Sequence[float], c
     settings.num_cols = columns * len(kinds)
     if levels:
         settings.num_rows, settings.difficulties = len(levels), list(levels)
-    for kind in section_keys(settings.terrain_proportions):
-        setattr(settings.terrain_proportions, kind, 0.0)
+    proportions = settings.terrain_proportions
+    for kind in section_keys(proportions):
+        setattr(proportions, kind, 0.0)
     for kind in kinds:
-        setattr(settings.terrain_proportions, kind, 1.0 / len(kinds))
+        setattr(proportions, kind, 1.0 / len(kinds))
+    proportions._names = section_keys(proportions)  # also those that the task does not declare

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -76,8 +76,8 @@ class Drawing:
     @classmethod
     def of_task(cls, task: LeggedRobot) -> Drawing:
         """Return the robot of a task on its ground, with the joints in the task's order."""
-        terrain: Any = task.terrain  # rough ground if it has a map
-        ground = Ground(terrain.layout) if terrain.map else None
+        layout = getattr(task.terrain, "layout", None)
+        ground = Ground(layout) if isinstance(layout, Layout) else None  # a user's own is drawn as a plane
         return cls(drawn_model(resource_path(task.cfg.asset.file), ground, task.dof_names), ground)
 
     def move(self, qpos: np.ndarray) -> None:

@@ -9,7 +9,8 @@ from support.control import IN_THE_AIR
 from support.scripts import run_here
 from support.settings import error_of
 
-from legged_torque.envs import task_registry
+from legged_torque.envs import A1TorqueCfg, TorqueRobot, task_registry
+from legged_torque.envs.base.commands import UniformCommands
 from legged_torque.envs.base.crossing import Grounds
 from legged_torque.envs.base.evaluation import evaluation_cfg
 
@@ -93,6 +94,32 @@ def test_ranges_grow(make_task, monkeypatch, tracking, shares):
     assert not evaluation_cfg(task.cfg, 2).commands.curriculum
     fixed = {"commands.fixed": [0.0, 0.0, 0.0]}
     assert "curriculum has no effect with commands.fixed" in error_of(make_task, "a1_torque", 1, **changes, **fixed)
+
+
+class Bound(UniformCommands):
+    """Binds a tensor to another one, in its own constructor or in a step."""
+
+    def __init__(self, name, settings, task):
+        super().__init__(settings, task)
+        self.name, self.phase = name, torch.zeros(task.num_envs)
+        if name == "is_new":
+            self.is_new = torch.zeros(1, dtype=torch.bool)
+
+    def follow(self):
+        setattr(self, self.name, getattr(self, self.name).clone())
+
+
+@pytest.mark.parametrize("name", ["values", "headings", "low", "is_new", "phase", None])
+def test_generators_write_in_place(make_task, name):
+    """A tensor that the step holds is not bound to another one, and what builds a generator returns one."""
+
+    class Cfg(A1TorqueCfg):
+        class commands:
+            def build(self, task):
+                return name and Bound(name, self, task)
+
+    message = f"write {name} of Bound in place" if name else "commands.build must return UniformCommands"
+    assert message in error_of(TorqueRobot, Cfg())
 
 
 def test_a_generator_of_ones_own(tmp_path, make_task, monkeypatch):

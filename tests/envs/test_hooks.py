@@ -84,6 +84,13 @@ def test_a_misspelt_hook_that_only_calls_itself():
     assert "Port.action_term is never called; did you mean 'action_terms'?" in line
 
 
+@pytest.mark.parametrize("value", [None, 1.0, torch.tensor(1.0), torch.ones(2, 1)])
+def test_rewards_that_are_not_one_number_for_each_world(value):
+    """They are refused by name when the task is built."""
+    line = error_of(robot(_reward_torques=lambda self: value), small())
+    assert line.startswith("reward term 'torques' must be ") and "(2,)" in line
+
+
 @pytest.mark.parametrize("name", ["reset_buf", "commands", "obs_buf", "rew_buf", "count"])
 def test_tensors_stay(name):
     """A tensor that a step shares cannot be replaced by another one, as legged_gym's code does; writing it works."""

@@ -1,18 +1,22 @@
 """Robots, terms, parameters and grounds of a user: refusals by name, and a ground that needs no change of tasks."""
 
+import numpy as np
 import pytest
 import torch
 from support.settings import error_of
 
+from legged_torque.deploy.export import unknown_parts
 from legged_torque.envs.base.asset import nominal_pose
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors.config import by_joint
 from legged_torque.sim.randomization import RandomParameter
+from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.rough import TERRAINS
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.mirroring import SCALAR
+from legged_torque.viewer.drawing import Drawing
 
 LEGS = ("FR", "FL", "RR", "RL")
 
@@ -58,21 +62,26 @@ def test_robot_without_mirrored_legs(make_task):
         (("image", (2, 2, 2), None), "observation 'image' has the shape (2, 2, 2), not (2, size)"),
         (("own", (2, 2, 2), SCALAR), "observation 'own' has 4 values, 4 scales and 1 in its mirror image"),
         (("own", (2,), None), "observation 'own' has the shape (2,), not (2, ...)"),
+        (("phase", None, None), "observation 'phase' must be a tensor, not None"),
+        (
+            ("late", (2, 1), None),
+            "the sensed observation 'late' must be float32 (2, 1) on cpu, not float32 (2,)",
+        ),
     ],
 )
 def test_observation_terms_that_do_not_fit(term, message):
     """A name twice, other shapes and another number of scales or mirrored values are refused, also of "own" groups."""
     name, shape, *rest = term
-    group = "group" if name == "own" else ""
+    more = {"own": {"group": "group"}, "late": {"sensed": lambda: torch.zeros(2)}}.get(name, {})
 
     class Robot(LeggedRobot):
         def observation_terms(self):
-            own = ObservationTerm(name, lambda: torch.zeros(shape), *rest, group=group)
+            own = ObservationTerm(name, lambda: shape and torch.zeros(shape), *rest, **more)
             return [*super().observation_terms(), own]
 
     cfg = A1Cfg()
     cfg.env.num_envs = 2
-    assert error_of(Robot, cfg) == message
+    assert error_of(Robot, cfg).startswith(message)
 
 
 @pytest.mark.parametrize(
@@ -89,10 +98,23 @@ def test_observation_terms_that_do_not_fit(term, message):
             lambda task: RandomParameter("sway", "dof_damping", [6, 0], {"add": [0.0, 1.0]}),
             "does not read 'dof_damping' of the trunk's free joint",
         ),
+        (lambda task: RandomParameter("mass", "body_mas", [2], {}), "did you mean 'body_mass'?"),
+        *(
+            (
+                lambda task, columns=columns, field=field: RandomParameter("mass", field or task.p_gains, columns, {}),
+                f"'mass' must be different numbers from 0 to {last}, one or more, not {columns}",
+            )
+            for columns in ([], [-1], [0, 0], [99], [1.5])
+            for field, last in (("body_mass", 13), (None, 11))
+        ),
+        (
+            lambda task: RandomParameter("gain", task.p_gains, [0], {}, add_unit=[1.0, 2.0]),
+            "add_unit of random parameter 'gain' must be one number or 1, one per column, not [1.0, 2.0]",
+        ),
     ],
 )
 def test_parameters_that_do_not_fit(make, message):
-    """One that changes the model unseen, has a name twice, or a mirror image that is unknown or of another size."""
+    """One that changes the model unseen, has a name twice, no such numbers, or a mirror image that does not fit."""
 
     class Robot(LeggedRobot):
         def random_parameters(self):
@@ -101,6 +123,9 @@ def test_parameters_that_do_not_fit(make, message):
     cfg = A1Cfg()
     cfg.env.num_envs, cfg.domain_rand.randomize_parameters = 2, True
     assert message in error_of(lambda: Robot(cfg).mirror)
+    if "columns" in message or "did you mean" in message:  # whether or not anything is drawn
+        cfg.domain_rand.randomize_parameters = False
+        assert message in error_of(Robot, cfg)
 
 
 class Raised(Terrain):
@@ -123,6 +148,21 @@ def test_a_ground_comes_without_touching_tasks(make_task, monkeypatch):
     torch.testing.assert_close(task._reward_base_height(), (task.base_pos[:, 2] - 0.403).square())
     torch.testing.assert_close(task.get_observations()["critic"][:, 48], task.base_pos[:, 2] - 0.1)
     assert (task.base_pos[:, 1] == 1.0).all()
+
+
+class Hills(Terrain):
+    """Ground with a map of its own, but without tiles."""
+
+    def __init__(self, settings, num_envs, device):
+        self.map = HeightMap(np.zeros((41, 41), np.float32), 0.5, (-10.0, -10.0), device)
+
+
+def test_a_ground_without_tiles(make_task, monkeypatch):
+    """It is drawn as a plane, and exports say that they lack it."""
+    monkeypatch.setitem(TERRAINS, "hills", Hills)
+    task = make_task("a1_torque", 1, **{"terrain.mesh_type": "hills"})
+    assert Drawing.of_task(task).ground is None
+    assert unknown_parts(task, {"actions": {"terms": []}}) == ["the ground Hills is not described"]
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,16 @@ import warp as wp
 from support.control import HIGH_UP, time_out
 from support.settings import error_of, torques_in_torch
 
+from legged_torque.deploy.export import unknown_parts
 from legged_torque.envs.approaches.torque import TorqueRobot
-from legged_torque.envs.base.legged_robot import IN_TORCH
+from legged_torque.envs.base.legged_robot import IN_TORCH, LeggedRobot
 from legged_torque.envs.base.sweep import Sweep
+from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.envs.tasks import A1TorqueCfg
 from legged_torque.motors.config import DelayCfg, MotorCfg
 from legged_torque.motors.kernel import read
+from legged_torque.motors.model_config import EncoderCfg, LagCfg
+from legged_torque.motors.models import EncoderModel, ModelMotor
 from legged_torque.motors.motor import Motor
 from legged_torque.sim.randomization import RandomParameter
 
@@ -246,6 +250,77 @@ def test_mistakes():
     assert "one link that acts on actions at most, not delay, bus" in error_of(make, 1, ("delay", "bus", "curve"))
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"acts_on": "action"}, "unknown acts_on of Own 'action'; did you mean 'actions'?"),
+        ({"apply": Motor.apply}, "Own has no apply"),
+        (
+            {"apply": lambda motor, wanted, *_: wanted[:, :1]},
+            "Own.apply returns must be float32 (3, 12)",
+        ),
+        ({"reset": lambda motor, mask: motor.buffer("before", 2)}, "Own has the buffer 'before' twice"),
+    ],
+)
+def test_models_that_lack_something(monkeypatch, changes, message):
+    """They are refused by name when the task is built, as are settings that build no motor."""
+    monkeypatch.setattr(LateCfg, "build", lambda cfg, joints: type("Own", (LateMotor,), changes)(cfg, joints))
+    assert message in error_of(make, 3, ["late"])
+    monkeypatch.setattr(LateCfg, "build", lambda cfg, joints: None)
+    assert error_of(make, 3, ["late"]) == "motors.late.build must return a Motor, not None"
+    monkeypatch.setattr(LateCfg, "build", MotorCfg.build)
+    assert error_of(make, 3, ["late"]) == "late has no build"
+
+
+def test_torques_of_another_shape():
+    """A task's own torques are refused like a motor's."""
+    cfg = OwnMotorsCfg()
+    cfg.env.num_envs = 2
+    kind = type("Own", (TorqueRobot,), {"_compute_torques": lambda task, actions: actions[:, :1]})
+    assert "Own._compute_torques returns must be float32 (2, 12)" in error_of(kind, cfg)
+
+
+class HalfLag(ModelMotor):
+    """A lag with half of the torque."""
+
+    def apply(self, wanted, pos, vel, substep):
+        return 0.5 * super().apply(wanted, pos, vel, substep)
+
+
+class Biased(EncoderModel):
+    """Encoders with an error."""
+
+    def measured(self, pos, vel):
+        return pos + 0.1, vel
+
+
+NOTHING = {"actions": {"terms": []}}  # a description
+
+
+def test_models_that_inherit_ours(monkeypatch):
+    """What they override counts, no kernel of ours replaces it, and no export describes it by ours."""
+    monkeypatch.setattr(LagCfg, "build", lambda cfg, joints: HalfLag(cfg, joints))
+    monkeypatch.setattr(EncoderCfg, "build", lambda cfg, joints: Biased(cfg, joints))
+    task = make(chain=["ideal", "lag"])
+    assert IN_TORCH in task.notes[0] and unknown_parts(task, NOTHING) == ["the motor 'lag' has no describe()"]
+    task.step(torch.ones(3, 12))
+    torch.testing.assert_close(task.torques, torch.full((3, 12), 4.0))  # of 8 N m
+    cfg = A1Cfg()
+    cfg.env.num_envs, cfg.motors.chain, cfg.control.decimation = 3, ["encoder", "ideal"], 1
+    task = LeggedRobot(cfg)
+    pos, vel = task.dof_pos.clone(), task.dof_vel.clone()
+    task.step(torch.zeros(3, 12))
+    wanted = task.p_gains * (task.default_dof_pos - pos - 0.1) - task.d_gains * vel
+    torch.testing.assert_close(task.torques, wanted.clamp(-33.5, 33.5))
+
+
+def test_settings_of_links_that_are_not_in_the_chain(make_task):
+    """They have no effect, as a note says."""
+    idle = {"motors.friction.coulomb_friction": 0.5, "motors.lag.draws": {"time_constant": {"set": [0.001, 0.003]}}}
+    notes = [f"motors.{name} has no effect: motors.chain lacks '{name}'" for name in ("lag", "friction")]
+    assert sorted(make_task("a1_torque", 1, **idle).notes) == sorted(notes)
+
+
 def test_a_delay_of_another_name():
     """Its range keeps its time at another rate, sweeps name its unit, and parts of a control step may be refused."""
     cfg = OwnMotorsCfg()
@@ -312,3 +387,10 @@ def test_torque_perturbation(make_task, in_torch):
     assert np.array_equal(before, weights[0])
     task.reset()
     assert not np.isclose(before, weights[0]).any()
+
+
+def test_motors_write_in_place(monkeypatch):
+    """What a model keeps is not bound to another tensor, which a captured step would not read."""
+    monkeypatch.setattr(LateMotor, "apply", lambda motor, *_: setattr(motor, "before", motor.before.clone()))
+    line = error_of(make, 3, ["late"])
+    assert line.startswith("write before of LateMotor in place")

@@ -181,13 +181,21 @@ class FlatCfg(SensorCfg):
         return type("Flat", (Sensor,), flat)(self, state)
 
 
+def test_sensors_write_in_place(monkeypatch):
+    """The measurements that others read are not bound to another tensor."""
+    monkeypatch.setattr(DownwardRay, "measure", lambda sensor: setattr(sensor, "values", sensor.values.clone()))
+    cfg = RayCfg()
+    cfg.env.num_envs = 2
+    assert error_of(RayRobot, cfg).startswith("write values of DownwardRay in place")
+
+
 @pytest.mark.parametrize(("shape", "delay"), [([2], 0.0), ([2], 0.04), ([2, 1], 0.0), ([2, 2], 0.04)])
 def test_other_shapes(shape, delay):
     """A measurement of another shape than the sensor's is refused when the task is built."""
     cfg = RayCfg()
     cfg.env.num_envs, cfg.sensors.flat = 2, FlatCfg()
     cfg.sensors.flat.measured, cfg.sensors.flat.delay = shape, delay
-    assert error_of(RayRobot, cfg) == f"Flat.measure returns the shape {tuple(shape)}, not (2, 3)"
+    assert f"must be float32 (2, 3) on cpu, not float32 {tuple(shape)} on cpu" in error_of(RayRobot, cfg)
 
 
 def test_the_name_of_the_height_scan():

@@ -17,6 +17,7 @@ from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.terrain.height_map import HeightMap
 from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.rough import make_terrain
+from legged_torque.terrain.selection import named_kinds, select_tiles
 from legged_torque.terrain.tiles import TILES, Grid
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.task_registry import task_registry
@@ -187,12 +188,16 @@ def test_a_kind_of_ones_own(monkeypatch):
     slopes = np.diff(layout.tile(5, layout.kinds().index("ramp")), axis=0) / 0.05
     np.testing.assert_allclose(slopes, np.repeat([0.0, 0.15], [100, 60])[:, None].repeat(161, 1), atol=1e-9)
     only = {"cfg": names["RampCfg"](), "terrain_proportions": {"ramp": 1.0}, "difficulty_range": [0.5, 0.5]}
-    ground = make_ground(**only)
+    ground, cfg = make_ground(**only), A1Cfg()
+    select_tiles(cfg.terrain, named_kinds(["all"]), [], 1)
+    cfg.check()  # which declares no share of it
+    assert Layout.of(cfg.terrain).kinds() == list(TILES)
     place = torch.tensor([[2.02, 0.0, 0.0]])
     torch.testing.assert_close(ground.map.height(place), torch.tensor([0.15 * 2.02]))
-    monkeypatch.setitem(TILES, "ramp", lambda difficulty, rng, grid: np.zeros(3))
-    line = error_of(make_ground, **only)
-    assert line == "the kind of tile 'ramp' must return finite heights of shape (121, 121)"
+    for heights in (np.zeros(3), None):
+        monkeypatch.setitem(TILES, "ramp", lambda difficulty, rng, grid, heights=heights: heights)
+        line = error_of(make_ground, **only)
+        assert line == "the kind of tile 'ramp' must return finite heights of shape (121, 121)"
     monkeypatch.delitem(TILES, "ramp")
     assert "unknown kind in terrain.terrain_proportions 'ramp';" in error_of(make_ground, **only)
 

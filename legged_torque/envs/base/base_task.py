@@ -20,12 +20,12 @@ from legged_torque.sim.compiled import compiled
 from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.buffers import copy_state
+from legged_torque.utils.buffers import InPlace, copy_state
 from legged_torque.utils.config import flat, successor, to_dict
 from legged_torque.utils.errors import UserError
 
 
-class BaseTask(VecEnv):
+class BaseTask(InPlace, VecEnv):
     """The half of :class:`~legged_torque.envs.base.legged_robot.LeggedRobot` that faces a learner.
 
     A control step replays as one CUDA graph on a GPU. Hence the rules for everything that runs inside :meth:`_step`:
@@ -55,8 +55,6 @@ class BaseTask(VecEnv):
     _parts: Sequence[Callable[[], None]] = ()
     """What a step does with torch, in the order of the step, between what Warp's kernels do."""
     _is_compiled = False
-    _shared: frozenset[str] = frozenset()
-    """Attributes that are tensors which others hold, too."""
 
     def __init__(self, num_envs: int, device: str) -> None:
         """Allocate rewards and counters of ``num_envs`` worlds on the device, "cpu" or "cuda:N"."""
@@ -67,12 +65,6 @@ class BaseTask(VecEnv):
         self._keeps_final = False
         self._world_state: dict[str, Tensor] = {}
         self.step_graph = CudaGraph(self._step, device)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse another tensor for an attribute of :attr:`_shared`: nobody else would see it."""
-        if name in self._shared and value is not getattr(self, name):
-            raise UserError(f"write the task's {name} in place, {name}.copy_(...): a step would not see another tensor")
-        super().__setattr__(name, value)
 
     def __getattr__(self, name: str) -> Any:
         """Refuse legged_gym's attributes with their successors; Python calls this for what does not exist."""

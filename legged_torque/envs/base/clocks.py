@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from typing import Any
 
-from legged_torque.motors.config import DelayCfg, LatencyCfg
+from legged_torque.motors.config import DelayCfg, LatencyCfg, MotorCfg
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError
 
 
@@ -45,10 +46,11 @@ def delays(cfg: Any) -> dict[str, LatencyCfg]:
     return links | {"sensing.delay": cfg.sensing.delay}
 
 
-def idle_delays(cfg: Any) -> Iterator[str]:
-    """Yield a note for each delay that is set, but is no link of the chain of motors."""
+def idle_links(cfg: Any) -> Iterator[str]:
+    """Yield a note for each section of motors that is set, but is no link of their chain."""
     for name, link in vars(cfg.motors).items():
-        is_set = isinstance(link, DelayCfg) and (link.range[1] or link.jitter or link.loss)
+        kind = DelayCfg if isinstance(link, DelayCfg) else type(link)
+        is_set = isinstance(link, MotorCfg) and to_dict(link) != to_dict(kind())
         if is_set and name not in cfg.motors.chain:
             yield f"motors.{name} has no effect: motors.chain lacks '{name}'"
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from legged_torque.envs.base.commands_config import CommandsCfg
 from legged_torque.envs.base.curriculum import RangeCurriculum
 from legged_torque.sim import kernels
+from legged_torque.utils.buffers import InPlace
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.math import yaw
 
@@ -18,7 +19,7 @@ HEADING_GAIN = 0.5
 """Commanded yaw rate per angle that is left to a heading [1/s], as in legged_gym."""
 
 
-class UniformCommands:
+class UniformCommands(InPlace):
     """Draws commands uniformly, from ranges that may grow; a share of the robots is to stand.
 
     Inherit for a generator of your own, and override :meth:`draw`, or :meth:`follow` for commands that change with
@@ -51,6 +52,7 @@ class UniformCommands:
             self.curriculum = RangeCurriculum(settings.curriculum_start, *velocities, task.max_episode_length)
         if settings.fixed:
             self.hold(settings.fixed)
+        self.hold_tensors()
 
     def hold(self, command: Sequence[float] | None) -> None:
         """Give all worlds one command of three numbers from the next step on; None draws new ones."""
@@ -119,3 +121,12 @@ class UniformCommands:
         stands = {"stands": self._stands} if self.settings.standing_share else {}
         ranges = {"ranges": self.curriculum.state_dict()} if self.curriculum else {}
         return {"headings": self.headings, **stands, **ranges}
+
+
+def make_commands(task: Any) -> UniformCommands:
+    """Return the generator that the settings of a task build; a UserError if it is none."""
+    generator = task.cfg.commands.build(task)
+    if not isinstance(generator, UniformCommands):
+        raise UserError(f"commands.build must return UniformCommands or what inherits it, not {generator}")
+    generator.hold_tensors()  # also those of a subclass
+    return generator

@@ -5,15 +5,15 @@ import math
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParameters, position_residual
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
-from legged_torque.envs.base.clocks import idle_delays
+from legged_torque.envs.base.clocks import idle_links
+from legged_torque.envs.base.commands import make_commands
 from legged_torque.envs.base.health import watched
-from legged_torque.envs.base.hooks import check_methods
+from legged_torque.envs.base.hooks import check_methods, check_terms
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -113,7 +113,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.health = Health(watched(self.state, kept, self.rewards, self.observations), self.sim.diverged)
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
-        self._shared = frozenset(name for name, value in vars(self).items() if isinstance(value, (Tensor, TensorDict)))
+        self.hold_tensors()
+        check_terms(self)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -174,7 +175,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         decimation, pos, vel = self.cfg.control.decimation, self.dof_pos, self.dof_vel
         after_step = self.meter.begin() + self.sensors.begin_step()
         for i in range(decimation):
-            if self._torque_kernel and not self._is_overridden():
+            if self._torque_kernel and not self.computes_in_torch():
                 self._torque_kernel.launch(i)
             else:
                 if i == 0 or self.cfg.control.refresh_torques:
@@ -184,9 +185,10 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
             for look in after_step:
                 look()
 
-    def _is_overridden(self) -> bool:
-        """Return whether torques are computed by another method than that of this class."""
-        return getattr(self._compute_torques, "__func__", None) is not LeggedRobot._compute_torques
+    def computes_in_torch(self) -> bool:
+        """Return whether torques are not computed by one kernel: a motor has none, or a method is a user's."""
+        method = getattr(self._compute_torques, "__func__", None)
+        return not self._torque_kernel or method is not LeggedRobot._compute_torques
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
@@ -312,7 +314,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         self.symmetry = self.asset.symmetry(cfg.asset.mirrored_legs)
-        self.notes = [*self.asset.notes, *self.sim.notes, *idle_delays(cfg)]
+        self.notes = [*self.asset.notes, *self.sim.notes, *idle_links(cfg)]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""
@@ -346,14 +348,13 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._torque_kernel = None
         if cfg.control.refresh_torques:
             self._torque_kernel = self.motors.kernel(self.control_law.kernel, self.dof_pos, self.dof_vel, self.torques)
-            if self._is_overridden() or not self._torque_kernel:
+            if self.computes_in_torch():
                 self.notes.append(f"{type(self).__name__}: {IN_TORCH}")
         self.sensors = Sensors(cfg, self.state, self.motors)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
-        names = [name for name in dir(type(self)) if name.startswith("_reward_")]
-        functions = {name.removeprefix("_reward_"): getattr(self, name) for name in names}
+        functions = {name[len("_reward_") :]: getattr(self, name) for name in dir(self) if name.startswith("_reward_")}
         self.rewards = Rewards(functions, self.cfg.rewards, self.dt, self.num_envs, self.device)
         self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
         self.log = TaskLog(self.reward_names, self.num_envs, self.device)
@@ -361,8 +362,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
     def _init_random_events(self) -> None:
         """Prepare commands, initial states, random parameters and pushes."""
         cfg, model, rand = self.cfg, self.asset.mj_model, self.cfg.domain_rand
-        commands: Any = cfg.commands
-        self.command_generator = commands.build(self)
+        self.command_generator = make_commands(self)
         angles = torch.zeros(self.num_envs, 3, device=self.device)
         of_robot = self.motors.random_parameters() + self.sensors.random_parameters()
         pose, state = self.default_dof_pos.tolist(), (self.sim.qpos, self.sim.qvel)

@@ -17,6 +17,7 @@ from legged_torque.envs.base.state import RobotState
 from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.sensors.sensors import Sensors
+from legged_torque.utils.buffers import check_tensor
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
@@ -136,12 +137,11 @@ class Observations:
     ) -> None:
         """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is not for the critic."""
         self.terms = sorted((term for term in terms if not term.group), key=lambda term: term.privileged)
-        values = [term.value() for term in self.terms]
-        device = values[0].device
         self.sizes: dict[str, int] = {}
-        for term, value in zip(self.terms, values, strict=True):
-            _check(term, value, num_envs, self.sizes)
+        for term in self.terms:
+            _check(term, value := term.value(), num_envs, self.sizes)
             self.sizes[term.name] = value.shape[1]
+        device = value.device
         self._history_length, self._clip, self._add_noise = history_length, clip, add_noise
         scales = [_per_value(term.scale, self.sizes[term.name]) for term in self.terms]
         errors = [[term.noise * factor for factor in scale] for term, scale in zip(self.terms, scales, strict=True)]
@@ -244,9 +244,13 @@ def _check(term: ObservationTerm, values: Tensor, num_envs: int, before: dict[st
     """Raise a UserError if a term has a name twice, another shape, or too few or many scales or mirrored values."""
     if term.name in before:
         raise UserError(f"two observation terms are called '{term.name}'")
+    if not isinstance(values, Tensor):
+        raise UserError(f"observation '{term.name}' must be a tensor, not {values}")
     if len(values.shape) < 2 or len(values) != num_envs or (len(values.shape) > 2 and not term.group):
         wanted = f"({num_envs}, {'...' if term.group else 'size'})"
         raise UserError(f"observation '{term.name}' has the shape {tuple(values.shape)}, not {wanted}")
+    if term.sensed:
+        check_tensor(f"the sensed observation '{term.name}'", term.sensed(), values.shape, values.device)
     size = math.prod(values.shape[1:])
     scales, mirrored = len(_per_value(term.scale, size)), len(term.mirror.order) if term.mirror else size
     if (scales, mirrored) != (size, size):
