@@ -172,6 +172,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     from legged_torque.deploy.export import export_note
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
+    from legged_torque.learning.trainer import Trainer
 
     is_first = distributed.rank() == 0
     env, _ = task_registry.make_env(options.task, options, env_cfg)
@@ -179,6 +180,9 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
         print_notes([standing_note(env), draws_note(env_cfg)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
+    if not isinstance(runner, Trainer):
+        ours = "legged_torque.learning.runner:OnPolicyRunner"
+        raise UserError(f"runner.class_name must name {ours} or what inherits it, not {type(runner).__name__}")
     if train_cfg.pretraining.function and not options.resume and is_first:  # from whom the others get their networks
         from legged_torque.paper.gravity.pretrained import find_pretrained, pretrained_file, start_from
 

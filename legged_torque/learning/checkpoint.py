@@ -11,11 +11,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import tree_leaves, tree_map_only
 
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import is_whole_archive, write_whole
 from legged_torque.utils.limits import NotNegative, Number, check_value
+
+PLAIN = {"Tensor", "Parameter", "str", "int", "float", "bool", "NoneType"}
+"""Types that files may hold, in dictionaries and lists; others would not load without running code."""
 
 
 class Background:
@@ -64,8 +67,11 @@ def cloned(state: dict[str, Any]) -> dict[str, Any]:
 def write(file: Path, content: dict[str, Any]) -> str:
     """Write tensors and plain values, and return the SHA-256 of the file.
 
-    The file is either complete or absent at any time; a UserError if it cannot be written.
+    The file is either complete or absent at any time; a UserError if it cannot be written, or not be loaded again.
     """
+    if other := {type(part).__name__ for part in tree_leaves(content)} - PLAIN:
+        kinds = ", ".join(sorted(other))
+        raise UserError(f"'{file}' cannot be written: it takes tensors and plain values only, not {kinds}")
     buffer = io.BytesIO()
     torch.save(content, buffer)
     write_whole(file, buffer.getvalue())

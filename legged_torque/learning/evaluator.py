@@ -1,9 +1,10 @@
 """Evaluation of a policy while it learns, in worlds of their own."""
 
+import contextlib
 import copy
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,7 @@ class TrainingEvaluator:
         evaluation = self._build()
         evaluation.task.total_steps.copy_(self._task.total_steps)
         evaluation.task.update_curriculum()
-        with own_random_numbers(self._task.device, self._random_state):
+        with own_random_numbers(self._task.device, self._random_state), _in_evaluation(self._policy):
             for _ in range(int(min(self._warm_up_runs, max(0, most_steps / num_steps - 1)))):
                 run()
             self._warm_up_runs = 0
@@ -134,6 +135,19 @@ class TrainingEvaluator:
             obs = evaluation.task.get_observations()
             for _ in range(num_steps):
                 obs = evaluation.step(self._acting(obs))
+
+
+@contextlib.contextmanager
+def _in_evaluation(policy: Any) -> Iterator[None]:
+    """Set a policy that is in training to evaluation, as ``evaluate.py`` has it, and back."""
+    is_training = getattr(policy, "training", False)
+    if is_training:
+        policy.eval()
+    try:
+        yield
+    finally:
+        if is_training:
+            policy.train()
 
 
 def make_evaluators(task: Any, policy: Policy, settings: dict, seed: int, capture: bool) -> list[TrainingEvaluator]:

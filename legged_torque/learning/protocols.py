@@ -176,7 +176,7 @@ def annealed(iteration: int, num_iterations: int, start: float) -> float:
 
 def check_methods(learner: type) -> None:
     """Raise a UserError if a class lacks methods of a :class:`Learner`."""
-    methods = (name for name in [*vars(Learner), *vars(Stateful)] if not name.startswith("_"))
+    methods = (name for name in ["construct_algorithm", *vars(Learner), *vars(Stateful)] if name[0] != "_")
     if missing := [name for name in methods if not callable(getattr(learner, name, None))]:
         raise UserError(f"algorithm.class_name: {learner.__name__} is no learner, it lacks {', '.join(missing)}")
 

@@ -41,13 +41,22 @@ class OnPolicyRunner(Trainer, runners.OnPolicyRunner):
             if "observations" not in str(error):
                 raise
             raise UserError(f"obs_groups: {error}") from error  # such as images for a network of vectors
+        except TypeError as error:
+            if "argument" not in str(error):
+                raise
+            raise UserError(f"algorithm, actor or critic: {error}") from error  # such as a setting that a class lacks
         self.logger.git_status_repos = [legged_torque.__file__]  # whose uncommitted changes a run's folder keeps
         Trainer.__init__(self, env, self.alg, train_cfg, self.logger)
         symmetry = getattr(self.alg, "symmetry", None)
         if log_dir and symmetry:  # refuse what has no mirror image before a folder is made
-            symmetry.data_augmentation_func(env=env, obs=env.get_observations()[:1], actions=None)
+            obs, actions = env.get_observations()[:1], torch.zeros(1, env.num_actions, device=env.device)
+            images = symmetry.data_augmentation_func(env=env, obs=obs, actions=actions)
+            if len({len(image) for image in images}) > 1:
+                raise UserError("symmetry_cfg.data_augmentation_func must return as many actions as observations")
         if log_dir and hasattr(self.alg, "allocate"):  # so that too much memory is refused before that, too
             self.alg.allocate()
+        if log_dir and hasattr(env, "try_step"):
+            env.try_step()
 
     def get_inference_policy(self, device: str | None = None) -> nn.Module:
         """Return the policy for inference in the worlds of ``env``, on a device if one is given."""

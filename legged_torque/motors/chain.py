@@ -85,6 +85,7 @@ class MotorChain:
 
         Called once per physics step; arguments as of :meth:`~legged_torque.motors.motor.Motor.apply`.
         """
+        check_tensor("what _compute_torques returns", wanted, pos.shape, pos.device)
         torques, state = self.strength * wanted, self.measured(pos, vel)
         for link in self._behind_law:
             if link is self.encoder:

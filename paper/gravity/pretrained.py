@@ -77,11 +77,14 @@ def find_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device:
 
 
 def make_pretrained(file: Path, task: str, env_cfg: Any, train_cfg: Any, device: str) -> dict[str, Any]:
-    """Make a task's pre-trained policy and return the report on it; a UserError if the task has no pre-training."""
+    """Make a task's pre-trained policy and return the report on it; a UserError if the task has none that does so."""
     if not train_cfg.pretraining.function:
         raise UserError(f"task '{task}' has no pre-training: its pretraining.function is empty")
     check_output(file)
-    actor, report = resolve_callable(train_cfg.pretraining.function)(task, env_cfg, train_cfg, device)
+    made = resolve_callable(train_cfg.pretraining.function)(task, env_cfg, train_cfg, device)
+    if not (isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], dict)):
+        raise UserError("pretraining.function must return a network and a dictionary, the report on it")
+    actor, report = made
     content = {"actor_state_dict": actor.state_dict(), "spaces": spaces(env_cfg, train_cfg), "report": report}
     checkpoint.write(file, content)
     return report

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from rsl_rl.models import MLPModel
 from support.control import REAL_MOTORS
 from support.exports import TRAINING, export_random
 from support.scripts import SMALL, assert_told_in_one_line, run_here
@@ -289,6 +290,22 @@ def test_networks_that_are_not_exported(make_task, tmp_path, change, message):
     line = error_of(export_policy, make_task("a1_position", 3), model, tmp_path / "out", "a1_position", TRAINING)
     assert message in line and not list(tmp_path.iterdir())
     assert "no is_recurrent" in export_note(make_task("a1_position", 3), SimpleNamespace(obs_groups=["policy"]))
+
+
+class Half(MLPModel):
+    """An actor with half of the output, which rsl_rl's exports do not know."""
+
+    def forward(self, obs, *args, **kwargs):
+        """Half of the mean actions."""
+        return 0.5 * super().forward(obs, *args, **kwargs)
+
+
+def test_networks_that_are_exported_as_others(make_task, tmp_path):
+    """A class whose exports compute something else than it does is refused, and nothing is written."""
+    task, distribution = make_task("a1_position", 4), {"class_name": "GaussianDistribution"}
+    model = Half(task.get_observations(), {"actor": ["policy"]}, "actor", 12, [8], "elu", False, distribution)
+    line = error_of(export_policy, task, model, tmp_path / "out", "a1_position", TRAINING)
+    assert "the exported network differs from the checkpoint's by" in line and not list(tmp_path.iterdir())
 
 
 def test_motors_of_a_user(tmp_path):

@@ -190,7 +190,7 @@ def test_height_and_a_term_of_ones_own():
 def test_wrong_terms():
     """Terms of another shape or type, and settings without a term, are refused by name."""
     for name in ("wrong_shape", "wrong_type"):
-        assert f"'{name}'" in error_of(make, **{name: True})
+        assert f"'{name}'" in error_of(make(**{name: True}).try_step)
 
     class TypoCfg(FarCfg):
         class terminations:

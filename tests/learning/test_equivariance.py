@@ -5,7 +5,7 @@ import torch
 from rsl_rl.models import MLPModel
 from support.control import mirror_joints, mirror_policy
 from support.rollouts import parameters, record_rollout
-from support.settings import build_runner
+from support.settings import build_runner, error_of
 from support.wide_ppo import MIRROR, Mirrored, build, choose, mirrored
 from tensordict import TensorDict
 
@@ -129,6 +129,9 @@ def test_networks_that_were_not_equivariant(make_task, tmp_path):
     runner.learn(1)
     with pytest.raises(UserError, match=r"not equivariant: they need --set algorithm\.symmetry_cfg\.use_equivariant"):
         build_runner(make_task, "a1_torque", **SMALL).load(f"{runner.log_dir}/model_1.pt")
+    player = build_runner(make_task, "a1_torque", **SMALL)
+    player.load(f"{runner.log_dir}/model_1.pt", {"actor": True})
+    assert "not equivariant" in error_of(player.learn, 1)
     _, cfg = task_registry.get_cfgs("a1_torque")
     older = to_dict(cfg)
     assert older["algorithm"]["symmetry_cfg"].pop("use_equivariant_networks")

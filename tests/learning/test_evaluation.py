@@ -1,6 +1,6 @@
 """Evaluation while training and of checkpoints: what is measured, when, and that training does not notice."""
 
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import pytest
@@ -147,6 +147,15 @@ def test_training_does_not_notice(make_runner):
         results.append({name: value.detach().clone() for name, value in result.items()})
     assert all(torch.equal(result[name], value) for result in results[1:] for name, value in results[0].items())
     assert rows[0] is None and len(rows[1]) == 3 and str(rows[1]) == str(rows[2])  # further evaluations change no other
+
+
+def test_policies_are_evaluated_as_they_are_used(make_runner, noted):
+    """Layers that act otherwise in training, such as dropout, do not in evaluations, and go on as before."""
+    runner, modes = make_runner(**{"evaluation.interval": 16}), []
+    runner.alg.actor.mlp[0].register_forward_hook(lambda layer, *_: modes.append(layer.training))
+    runner.learn(1)
+    changes = [first for first, second in pairwise(modes) if first != second]
+    assert modes[0] and changes == [True] and runner.alg.actor.training
 
 
 def test_curricula_are_those_of_the_training(make_runner, noted):

@@ -7,6 +7,8 @@ from rsl_rl.modules import MLP
 from support.point_masses import PointMasses, assert_holds_points, make_trainer
 from support.settings import build_runner, error_of
 
+from legged_torque.learning.protocols import check_methods
+
 GAMMA, BATCH, CAPACITY = 0.9, 64, 100
 
 
@@ -143,6 +145,8 @@ def test_what_does_not_fit_is_refused(make_task):
     deaf = type("Deaf", (TDLearner,), {"observe": property()})
     message = error_of(make_trainer, deaf)
     assert message == "algorithm.class_name: Deaf is no learner, it lacks observe"
+    message = error_of(check_methods, type("Idle", (TDLearner,), {"construct_algorithm": None}))
+    assert message == "algorithm.class_name: Idle is no learner, it lacks construct_algorithm"
     message = error_of(build_runner, make_task, "a1_torque", **{"algorithm.class_name": "PPO"})  # rsl_rl's own
     assert message.endswith(": PPO is no learner, it lacks observe, due, policy, state_dict, load_state_dict")
     forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})

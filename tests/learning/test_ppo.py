@@ -219,7 +219,6 @@ def test_returns_and_advantages(per_mini_batch):
     ("settings", "message"),
     [
         ({"optimizer": "adamm"}, "unknown optimizer 'adamm'; did you mean 'adam'?"),
-        ({"rnd_cfg": {"weight": 1.0}}, "does not support algorithm.rnd_cfg"),
         ({"num_mini_batches": SAMPLES + 1}, "num_mini_batches is 65, more than the samples of a rollout"),
     ],
 )

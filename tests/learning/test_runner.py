@@ -4,10 +4,14 @@ import math
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from support.settings import COMBINATIONS, TASKS, build_runner, error_of, networks
+from rsl_rl.models import MLPModel
+from support.settings import COMBINATIONS, TASKS, build_runner, error_of, get_cfgs, networks
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged_torque.learning import checkpoint
 
 WORLDS, STEPS = 4, 4
 BATCH = WORLDS * STEPS
@@ -121,6 +125,39 @@ def test_rollout_is_stored(make_runner):
         assert torch.equal(storage.dones[i].squeeze(-1).bool(), dones)
         torch.testing.assert_close(storage.rewards[i].squeeze(-1), rewards + 0.98 * values * time_outs)
     assert not torch.equal(obs[0]["policy"], obs[1]["policy"])
+
+
+class Gained(MLPModel):
+    """An actor that takes no further settings."""
+
+
+def test_classes_that_do_not_fit(make_runner, tmp_path):
+    """Settings that a class does not take, and functions that mirror observations alone, are refused by name."""
+
+    def mirror(env, obs, actions):
+        return torch.cat([obs, obs]), actions
+
+    _, cfg = get_cfgs()
+
+    class Actor(type(cfg.actor)):
+        class_name = f"{__name__}:Gained"
+        gain: float = 1.0
+
+    line = error_of(make_runner, "a1_position", actor=Actor())
+    assert line.startswith("algorithm, actor or critic: ") and "'gain'" in line
+    images = {"use_data_augmentation": True, "use_equivariant_networks": False, "data_augmentation_func": mirror}
+    images = {f"algorithm.symmetry_cfg.{name}": value for name, value in images.items()}
+    line = error_of(make_runner, "a1_position", log_root=tmp_path, **images)
+    assert line == "symmetry_cfg.data_augmentation_func must return as many actions as observations"
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_no_checkpoint_may_hold(tmp_path):
+    """A file that would not load again is not written."""
+    for other in (np.float64(0.5), np.zeros(2), {1, 2}, object()):
+        line = error_of(checkpoint.write, tmp_path / "model.pt", {"state": [torch.zeros(2), {"loss": other}]})
+        assert line.endswith(f"takes tensors and plain values only, not {type(other).__name__}")
+    assert not list(tmp_path.iterdir())
 
 
 def test_checkpoints_that_do_not_fit(make_runner, tmp_path):

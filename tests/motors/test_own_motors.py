@@ -265,7 +265,7 @@ def test_mistakes():
 def test_models_that_lack_something(monkeypatch, changes, message):
     """They are refused by name when the task is built, as are settings that build no motor."""
     monkeypatch.setattr(LateCfg, "build", lambda cfg, joints: type("Own", (LateMotor,), changes)(cfg, joints))
-    assert message in error_of(make, 3, ["late"])
+    assert message in error_of(lambda: make(3, ["late"]).try_step())
     monkeypatch.setattr(LateCfg, "build", lambda cfg, joints: None)
     assert error_of(make, 3, ["late"]) == "motors.late.build must return a Motor, not None"
     monkeypatch.setattr(LateCfg, "build", MotorCfg.build)
@@ -277,7 +277,7 @@ def test_torques_of_another_shape():
     cfg = OwnMotorsCfg()
     cfg.env.num_envs = 2
     kind = type("Own", (TorqueRobot,), {"_compute_torques": lambda task, actions: actions[:, :1]})
-    assert "Own._compute_torques returns must be float32 (2, 12)" in error_of(kind, cfg)
+    assert "_compute_torques returns must be float32 (2, 12)" in error_of(kind(cfg).try_step)
 
 
 class HalfLag(ModelMotor):
@@ -392,5 +392,5 @@ def test_torque_perturbation(make_task, in_torch):
 def test_motors_write_in_place(monkeypatch):
     """What a model keeps is not bound to another tensor, which a captured step would not read."""
     monkeypatch.setattr(LateMotor, "apply", lambda motor, *_: setattr(motor, "before", motor.before.clone()))
-    line = error_of(make, 3, ["late"])
+    line = error_of(make(3, ["late"]).try_step)
     assert line.startswith("write before of LateMotor in place")

@@ -19,6 +19,7 @@ from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.sim.compiled import compiled
 from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
+from legged_torque.sim.health import Health
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.buffers import InPlace, copy_state
 from legged_torque.utils.config import flat, successor, to_dict
@@ -50,6 +51,7 @@ class BaseTask(InPlace, VecEnv):
     command_generator: UniformCommands
     state: RobotState
     meter: StepMeter
+    health: Health
     obs_buf: TensorDict
     num_processes = 1
     _parts: Sequence[Callable[[], None]] = ()
@@ -128,6 +130,21 @@ class BaseTask(InPlace, VecEnv):
         """Say whether they do; the step is captured anew."""
         self._keeps_final, self._final = value, {}
         self.step_graph.reset()
+
+    def try_step(self) -> None:
+        """Make a control step and undo it: trainings find mistakes in a user's code before they make a folder.
+
+        Tensors of the task, what its worlds keep, and random numbers are afterwards as before.
+        """
+        named = vars(self) | vars(self.health)
+        tensors = [value for value in named.values() if isinstance(value, Tensor)]
+        tensors += flat(self.world_state_dict()).values()
+        before = [tensor.clone() for tensor in tensors]
+        with torch.random.fork_rng([self.device] if torch.device(self.device).type == "cuda" else []):
+            self._step()
+        for tensor, copy in zip(tensors, before, strict=True):
+            if not torch.equal(tensor, copy):
+                tensor.copy_(copy)
 
     def measure_steps(self) -> None:
         """Let :attr:`meter` measure all steps from now on; the step is captured anew."""

@@ -1,17 +1,12 @@
-"""Methods of task classes: those that are never called, such as legged_gym's hooks, and terms of a wrong shape."""
+"""Methods of task classes that are never called: legged_gym's hooks, misspelt hooks, terms without a setting."""
 
 import difflib
 import inspect
 from collections.abc import Iterator
 from types import CodeType
-from typing import Any
-
-import torch
-from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.utils.buffers import check_tensor
-from legged_torque.utils.config import flat, section_keys, successor
+from legged_torque.utils.config import section_keys, successor
 from legged_torque.utils.errors import refuse
 
 SIMILAR = 0.88  # share of letters from which on a method seems to be a misspelt hook
@@ -28,29 +23,6 @@ def check_methods(task: type, base: type, cfg: LeggedRobotCfg) -> None:
     methods = [(name, _code(value)) for owner in owners for name, value in vars(owner).items()]
     used = {used for name, code in methods if code for used in _names(code) if used != name}
     refuse([problem for owner in owners for problem in _idle(owner, base, terms, used)])
-
-
-def check_terms(task: Any) -> None:
-    """Raise a UserError unless torques, rewards and terminations of a task have the shapes and types that steps need.
-
-    What a step calls of a user's is called once; what it wrote into tensors of the task and the motors is undone.
-    """
-    tensors = [value for value in vars(task).values() if isinstance(value, Tensor)]
-    tensors += flat(task.motors.state_dict()).values()
-    before = [tensor.clone() for tensor in tensors]
-    pos, vel = task.dof_pos, task.dof_vel
-    if task.computes_in_torch():
-        wanted = task._compute_torques(task.motors.actions(pos, vel, 0))
-        check_tensor(f"what {type(task).__name__}._compute_torques returns", wanted, pos.shape, pos.device)
-        task.motors.apply(wanted, pos, vel, 0)
-    task._post_physics_step_callback()
-    for name, is_over in task.terminations.items():
-        check_tensor(f"termination '{name}'", is_over(), (task.num_envs,), task.device, torch.bool)
-    for name, function in task.rewards.functions.items():
-        check_tensor(f"reward term '{name}'", function(), (task.num_envs,), task.device)
-    for tensor, copy in zip(tensors, before, strict=True):
-        if not torch.equal(tensor, copy):
-            tensor.copy_(copy)
 
 
 def _code(value: object) -> CodeType | None:

@@ -13,7 +13,7 @@ from legged_torque.envs.base.base_task import BaseTask
 from legged_torque.envs.base.clocks import idle_links
 from legged_torque.envs.base.commands import make_commands
 from legged_torque.envs.base.health import watched
-from legged_torque.envs.base.hooks import check_methods, check_terms
+from legged_torque.envs.base.hooks import check_methods
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.observations import Observations, ObservationTerm, standard_terms
 from legged_torque.envs.base.random_events import RandomEvents
@@ -114,7 +114,6 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._parts = [self._compute_rewards_and_dones, self._update_sums, self._end_episodes]
         self._parts += [self._finish_step, self._begin_episodes, self._observe]
         self.hold_tensors()
-        check_terms(self)
         self.reset()
 
     # ---- hooks of the approaches -------------------------------------------------------------------------------------
@@ -175,7 +174,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         decimation, pos, vel = self.cfg.control.decimation, self.dof_pos, self.dof_vel
         after_step = self.meter.begin() + self.sensors.begin_step()
         for i in range(decimation):
-            if self._torque_kernel and not self.computes_in_torch():
+            if self._torque_kernel and not self._is_overridden():
                 self._torque_kernel.launch(i)
             else:
                 if i == 0 or self.cfg.control.refresh_torques:
@@ -185,10 +184,9 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
             for look in after_step:
                 look()
 
-    def computes_in_torch(self) -> bool:
-        """Return whether torques are not computed by one kernel: a motor has none, or a method is a user's."""
-        method = getattr(self._compute_torques, "__func__", None)
-        return not self._torque_kernel or method is not LeggedRobot._compute_torques
+    def _is_overridden(self) -> bool:
+        """Return whether torques are computed by another method than that of this class."""
+        return getattr(self._compute_torques, "__func__", None) is not LeggedRobot._compute_torques
 
     def post_physics_step(self) -> None:
         """Do what follows the physics: termination, rewards, resets, commands, observations."""
@@ -348,13 +346,14 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self._torque_kernel = None
         if cfg.control.refresh_torques:
             self._torque_kernel = self.motors.kernel(self.control_law.kernel, self.dof_pos, self.dof_vel, self.torques)
-            if self.computes_in_torch():
+            if self._is_overridden() or not self._torque_kernel:
                 self.notes.append(f"{type(self).__name__}: {IN_TORCH}")
         self.sensors = Sensors(cfg, self.state, self.motors)
 
     def _prepare_reward_functions(self) -> None:
         """Collect the functions of all terms with a scale that is not zero, and their weights."""
-        functions = {name[len("_reward_") :]: getattr(self, name) for name in dir(self) if name.startswith("_reward_")}
+        names = [name for name in dir(type(self)) if name.startswith("_reward_")]
+        functions = {name.removeprefix("_reward_"): getattr(self, name) for name in names}
         self.rewards = Rewards(functions, self.cfg.rewards, self.dt, self.num_envs, self.device)
         self.reward_names, self.episode_sums = self.rewards.names, self.rewards.episode_sums
         self.log = TaskLog(self.reward_names, self.num_envs, self.device)

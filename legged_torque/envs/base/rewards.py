@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.envs.base.curriculum import LinearCurriculum
+from legged_torque.utils.buffers import check_tensor
 from legged_torque.utils.config import section_keys, to_dict
 from legged_torque.utils.errors import check_names
 
@@ -16,7 +17,6 @@ class Rewards:
 
     Attributes:
         names: Names of the terms.
-        functions: What computes them, by name.
         terms: Weighted terms of the last step. Shape: (terms, num_envs).
         episode_sums: Weighted sums of each term over the episode so far. Shape: (terms, num_envs).
         only_positive: Whether the sum is clipped at 0 from below.
@@ -35,7 +35,7 @@ class Rewards:
         check_names("reward term", [*scales, *curricula], functions)
         self.names = list(scales)
         self.terms, self.episode_sums = (torch.zeros(len(self.names), num_envs, device=device) for _ in range(2))
-        self.functions, self._rows = {name: functions[name] for name in self.names}, self.terms.unbind()
+        self._functions, self._rows = [functions[name] for name in self.names], self.terms.unbind()
         self.only_positive = settings.only_positive_rewards
         self._scales = torch.tensor(list(scales.values()), dtype=torch.float32, device=device) * dt
         self._curriculum = LinearCurriculum([curricula.get(name) for name in self.names], device)
@@ -45,10 +45,15 @@ class Rewards:
         return self._scales * self._curriculum(total_steps)
 
     def compute(self, total_steps: Tensor) -> Tensor:
-        """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,)."""
+        """Compute all terms and return their sum; ``total_steps`` are those of training so far. Shape: (num_envs,).
+
+        A UserError if a term is no tensor of that shape.
+        """
         weights, total = self.weights(total_steps).unbind(), torch.zeros_like(self._rows[0])
-        for weight, function, row in zip(weights, self.functions.values(), self._rows, strict=True):
-            weighted = weight * function()
+        for name, weight, function, row in zip(self.names, weights, self._functions, self._rows, strict=True):
+            values = function()
+            check_tensor(f"reward term '{name}'", values, row.shape, row.device)
+            weighted = weight * values
             row.copy_(weighted)  # row by row: a GPU makes one kernel of all
             total = total + weighted
         return total.clamp(min=0.0) if self.only_positive else total

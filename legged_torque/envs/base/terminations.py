@@ -8,6 +8,7 @@ from torch import Tensor
 
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.state import RobotState
+from legged_torque.utils.buffers import check_tensor
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import check_names
 
@@ -37,8 +38,10 @@ class Terminations:
     def check_termination(self) -> None:
         """End episodes if a term says so, their state diverged, or their time is over, which alone is a time-out."""
         state, ended = self.state, self.state.diverged
-        for is_over in self.terminations.values():
-            ended = ended | is_over()
+        for name, is_over in self.terminations.items():
+            over = is_over()
+            check_tensor(f"termination '{name}'", over, ended.shape, ended.device, torch.bool)
+            ended = ended | over
         time_out = state.episode_length + self.steps_before >= self.max_episode_length
         state.reset_buf.copy_(ended | time_out)
         state.time_out_buf.copy_(time_out & ~ended)

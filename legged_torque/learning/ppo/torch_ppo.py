@@ -69,8 +69,6 @@ class TorchPPO(PPO):
         """
         if optimizer not in ("adam", "adamw"):  # of these torch can skip a step on the device
             raise unknown_name("optimizer", optimizer, ["adam", "adamw"])
-        if kwargs.get("rnd_cfg"):
-            raise UserError(f"{type(self).__name__} does not support algorithm.rnd_cfg")
         if actor.is_recurrent or critic.is_recurrent:
             raise UserError(f"{type(self).__name__} does not support recurrent models")
         symmetry = dict(kwargs.pop("symmetry_cfg", None) or {})
@@ -90,6 +88,7 @@ class TorchPPO(PPO):
         self.action_weights = torch.ones(storage.actions.shape[-1], device=self.device)
         self.actor.distribution.weights = self.action_weights
         self._control_law: Any = None
+        self._is_symmetric = True  # if networks shall be equivariant
         self._parts = [list(model.parameters()) for model in (self.actor, self.critic)]  # each is clipped by itself
         self._parameters = [*self._parts[0], *self._parts[1]]
         if self.mirrored:
@@ -110,6 +109,8 @@ class TorchPPO(PPO):
     @classmethod
     def construct_algorithm(cls, obs: TensorDict, env: Any, cfg: dict[str, Any], device: str) -> PPO:
         """Build the algorithm with its networks and storage, from settings in rsl_rl's layout."""
+        if cfg["algorithm"].get("rnd_cfg"):
+            raise UserError(f"{cls.__name__} does not support algorithm.rnd_cfg")
         algorithm = {**cfg["algorithm"], "class_name": cls.make}
         is_ours = cls.__module__.startswith("legged_torque.")  # a user's class may take gradient steps of its own
         if cfg["pretraining"]["function"] or not is_ours:  # pre-trained networks are not equivariant
@@ -128,7 +129,13 @@ class TorchPPO(PPO):
     # ---- for the trainer, see protocols.Learner --------------------------------------------------------------------
 
     def allocate(self) -> None:
-        """Raise a UserError if a rollout has fewer samples than minibatches; a policy that only plays needs none."""
+        """Raise a UserError if a rollout has fewer samples than minibatches, or networks have lost their symmetry.
+
+        A policy that only plays needs neither.
+        """
+        if not self._is_symmetric:
+            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
+            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
         worlds, steps = self.storage.num_envs, self.storage.num_transitions_per_env
         if worlds * steps < self.num_mini_batches:
             raise UserError(
@@ -226,14 +233,15 @@ class TorchPPO(PPO):
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load as rsl_rl does, and keep the learning rate the tensor that it was.
 
-        A UserError if learning goes on with equivariant networks and those of the checkpoint are not.
+        A UserError if learning goes on with equivariant networks and those of the checkpoint are not; after a part of
+        it was loaded, where learning begins.
         """
         learning_rate = self.learning_rate
         load_iteration = super().load(loaded_dict, load_cfg, strict)
         weights = parameters_to_vector(self._parameters)
-        if load_cfg is None and self.mirrored and not self.mirrored.is_symmetric(weights):
-            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
-            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
+        self._is_symmetric = not self.mirrored or self.mirrored.is_symmetric(weights)
+        if load_cfg is None:
+            self.allocate()
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
@@ -269,7 +277,7 @@ class TorchPPO(PPO):
     def _losses(self, batch: RolloutStorage.Batch, values: Tensor) -> tuple[Tensor, Tensor]:
         """Return what :meth:`loss` does, from the samples, their values and the actor's distribution of actions."""
         log_prob = self.actor.get_output_log_prob(batch.actions)
-        entropy = self.actor.output_entropy.mean()
+        entropy = self.actor.output_entropy.flatten()[: self.batch_size].mean()  # without mirror images, as in rsl_rl
         with torch.no_grad():  # from the policy that acted, without mirror images
             params = tuple(params[: self.batch_size] for params in self.actor.output_distribution_params)
             kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
