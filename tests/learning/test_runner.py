@@ -11,6 +11,7 @@ from rsl_rl.models import MLPModel
 from support.settings import COMBINATIONS, TASKS, build_runner, error_of, get_cfgs, networks
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from legged_torque.envs import task_registry
 from legged_torque.learning import checkpoint
 
 WORLDS, STEPS = 4, 4
@@ -131,19 +132,20 @@ class Gained(MLPModel):
     """An actor that takes no further settings."""
 
 
-def test_classes_that_do_not_fit(make_runner, tmp_path):
+def test_classes_that_do_not_fit(make_task, make_runner, tmp_path):
     """Settings that a class does not take, and functions that mirror observations alone, are refused by name."""
 
     def mirror(env, obs, actions):
         return torch.cat([obs, obs]), actions
 
-    _, cfg = get_cfgs()
+    _, cfg = get_cfgs("--task=a1_position")
 
     class Actor(type(cfg.actor)):
         class_name = f"{__name__}:Gained"
         gain: float = 1.0
 
-    line = error_of(make_runner, "a1_position", actor=Actor())
+    cfg.actor = Actor()
+    line = error_of(task_registry.make_alg_runner, make_task("a1_position", 4), train_cfg=cfg, log_root=None)
     assert line.startswith("algorithm, actor or critic: ") and "'gain'" in line
     images = {"use_data_augmentation": True, "use_equivariant_networks": False, "data_augmentation_func": mirror}
     images = {f"algorithm.symmetry_cfg.{name}": value for name, value in images.items()}
