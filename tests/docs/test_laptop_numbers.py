@@ -1,5 +1,6 @@
 """Numbers in the documents of the preset laptop, against the data."""
 
+import json
 from itertools import product
 
 import numpy as np
@@ -104,7 +105,7 @@ def test_equivariant_networks():
 
 
 def test_energy_of_equivariant_networks():
-    """Costs of transport with equivariant networks and with mirror images, of trainings that learned."""
+    """Costs of transport with equivariant networks, with mirror images and with wider networks, and their speed."""
     text = text_of("tried.md", "**Equivariant networks in place").replace("\n", " ")
     rough = pd.read_csv(DOCS / "results" / "rough" / "evaluations.csv.gz").query("steps > 246e6")
     rough = rough[rough["task"] == "a1_rough_torque_multihead"].groupby(["environment", "seed"])
@@ -113,16 +114,28 @@ def test_energy_of_equivariant_networks():
     said = f"of {ours.min():.2f} to {ours.max():.2f}, with mirror images {images.min():.2f} to {images.max():.2f} (four"
     assert f"{said} seeds each that learned, p = {welch(ours, images):.3f};" in text and {len(ours), len(images)} == {4}
     late = pd.read_csv(DOCS / "tried.csv.xz").query("run.str.startswith('late10/') and steps > 90e6")
-    late = late.groupby(["run", "task", "seed"])["cost_of_transport"].mean()
-    ours, images = late["late10/equivariant"], late["late10/images"]
-    lows, highs = ours.groupby("task").min(), ours.groupby("task").max()
-    said = "default torque has {:.2f} to {:.2f} (five seeds), with mirror images {:.2f} and {:.2f} (two, p = {:.2f};"
-    ends = lows["a1_torque"], highs["a1_torque"], *sorted(images["a1_torque"])
-    assert said.format(*ends, welch(images["a1_torque"], ours["a1_torque"])) in text
-    said = "stiffness {:.2f} to {:.2f}, with mirror images {:.2f} and {:.2f}, with learning rates up to 1e-2 {:.2f} and"
-    name = "a1_variable_stiffness"
-    ends = lows[name], highs[name], *sorted(images[name]), *sorted(late["late10/rates"][name])
-    assert f"{said} {{:.2f}}. Why".format(*ends) in text
+    ends = late.groupby(["run", "task", "seed"])[["track_percentage", "cost_of_transport"]].mean()
+    runs = ["late10/equivariant", "late10/images", "late10/wide"]
+    _, rows = rows_of("tried.md", "tracking, cost of transport")
+    assert len(rows) == 5
+    for task, *cells in rows:
+        for run, cell in zip(runs, cells, strict=True):
+            of = ends.query(f"run == '{run}' and task == {task.replace('`', chr(39))}")
+            assert cell == (", ".join(f"{mean:.3f}" for mean in of.mean()) if len(of) else "") and len(of) in (0, 5)
+    ours, images, wide = (ends.loc[run] for run in runs)
+    more, less = (np.log(each / images).dropna()["cost_of_transport"] for each in (ours, wide))
+    tracked = (images - ours)["track_percentage"]
+    chances = [stats.ttest_1samp(values, 0.0).pvalue for values in (more, tracked, less)]
+    assert (len(more), len(less)) == (25, 15) and chances[0] < 1e-3
+    said = f"cost {np.exp(more.mean()):.2f} times as much as mirror images (25 pairs by task and seed, p < 0.001), and"
+    said += f" track {tracked.mean():.3f} less (p = {chances[1]:.2f}). Wide ones cost {np.exp(less.mean()):.2f} times as"
+    assert f"{said} much (15, p = {chances[2]:.2f})," in text
+    measurements = json.loads((DOCS / "performance" / "h200.json").read_text())["measurements"]
+    speeds = next(each for each in measurements if "1.5 times as wide" in each["what"])
+    speeds = [np.mean(speeds[name]) / 1e6 for name in ("equivariant", "images", "wide")]
+    said = "makes {:.1f} million steps/s, with mirror images {:.1f}, with wide networks {:.1f} (two"
+    assert said.format(*speeds) in text
+    assert ends.loc["late10/rates", "track_percentage"].max() < 0.1
 
 
 def after(seconds):
