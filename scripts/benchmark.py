@@ -1,7 +1,5 @@
 """Measure speed and memory of training: ``python scripts/benchmark.py --num_envs 1024 4096``."""
 
-from __future__ import annotations
-
 import os
 
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to standard error when it starts
@@ -9,7 +7,7 @@ os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to
 import argparse
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.base.validation import check_env_cfg
@@ -19,9 +17,6 @@ from legged_torque.utils.errors import UserError, is_out_of_memory
 from legged_torque.utils.files import without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.runs import package_versions
-
-if TYPE_CHECKING:
-    from legged_torque.benchmark.measure import MemoryMeter
 
 COLUMNS = {
     "num_envs": (" worlds", 0),
@@ -51,7 +46,7 @@ def main() -> None:
             sizes.append(task_registry.get_new_cfgs(options))
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
-        from legged_torque.benchmark.measure import MemoryMeter
+        from legged_torque.benchmark.measure import MemoryMeter, measure
     for file in filter(None, (args.json, args.profile)):
         cli.check_output(file)
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
@@ -65,9 +60,18 @@ def main() -> None:
     print(" | ".join(title for title, _ in COLUMNS.values()), flush=True)
     rows: list[dict[str, Any]] = []
     for cfgs in sizes:
-        row = measure_size(args, cfgs, memory)
-        rows.append(row)
-        print_row(row, args.profile)
+        try:
+            row = measure(args.task, cfgs, memory, args.rounds, args.profile)
+        except Exception as error:
+            if not is_out_of_memory(error):
+                raise
+            row = {"num_envs": cfgs[0].env.num_envs, "error": "does not fit in memory"}
+        memory.clear()
+        rows.append(row | {"left_memory_mib": memory.used()})
+        cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
+        print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
+        if "profile" in row:
+            print(*row["profile"], f"The trace is in {args.profile}; Warp's kernels show on a GPU only.", sep="\n")
         if args.json:
             write_json(args.json, result | {"rows": rows})
 
@@ -80,35 +84,13 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    help_text = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
-    parser.add_argument("--profile", type=Path, help=help_text)
+    hint = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
+    parser.add_argument("--profile", type=Path, help=hint)
     args = parser.parse_args()
     cli.check_args(args, rounds=Count)
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
     return args
-
-
-def measure_size(args: argparse.Namespace, cfgs: tuple, memory: MemoryMeter) -> dict[str, Any]:
-    """Measure one size, which may not fit in memory, and give the memory back."""
-    from legged_torque.benchmark.measure import measure
-
-    try:
-        row = measure(args.task, cfgs, memory, args.rounds, args.profile)
-    except Exception as error:
-        if not is_out_of_memory(error):
-            raise
-        row = {"num_envs": cfgs[0].env.num_envs, "error": "does not fit in memory"}
-    memory.clear()
-    return row | {"left_memory_mib": memory.used()}
-
-
-def print_row(row: dict[str, Any], trace: Path) -> None:
-    """Print the numbers of one size; ``trace`` is the file of its trace, if there is one."""
-    cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
-    print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
-    if "profile" in row:
-        print(*row["profile"], f"The trace is in {trace}; Warp's kernels show on a GPU only.", sep="\n")
 
 
 if __name__ == "__main__":
