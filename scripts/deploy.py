@@ -79,14 +79,23 @@ def main() -> None:
         from legged_torque.deploy.policy import Policy
         from legged_torque.runtime.controller import Controller, default_rate
         from legged_torque.runtime.loop import RealTimeLoop
+        from legged_torque.runtime.operator import Datagrams, Gamepad, Keyboard, Unattended
         from legged_torque.runtime.session import Session
         from legged_torque.runtime.view import View
     policy: Any = Policy(args.policy)
     args.rate = args.rate or default_rate(policy.description["timing"]["control_frequency"])
-    policy = chirp(args, policy) if args.chirp else policy
+    if args.chirp:
+        from legged_torque.runtime.chirp import Chirp, confirm
+
+        policy = Chirp(policy, args.rate, args.chirp)
+        if args.interface != "sim":  # in which it does hang
+            confirm()
     transport = connect(args, policy)
     controller = Controller(policy, transport.joint_order, args.rate)
-    operators = operators_of(args, controller)
+    operators: list[Any] = [Keyboard(controller), *([Unattended(controller)] if args.walk else [])]
+    operators[0].begin_with(args.command or [0.0, 0.0, 0.0])
+    devices = [(Datagrams, args.udp), (Gamepad, args.gamepad)]
+    operators += [kind(controller, address) for kind, address in devices if address]
     log = None
     if args.log:
         from legged_torque.runtime.log import Log
@@ -133,26 +142,6 @@ def say(write: Callable[[], None]) -> None:
         pass
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def operators_of(args: argparse.Namespace, controller: Any) -> list[Any]:
-    """Return all that the robot obeys, and give it its first command."""
-    from legged_torque.runtime.operator import Datagrams, Gamepad, Keyboard, Unattended
-
-    operators: list[Any] = [Keyboard(controller), *([Unattended(controller)] if args.walk else [])]
-    operators[0].begin_with(args.command or [0.0, 0.0, 0.0])
-    devices = [(Datagrams, args.udp), (Gamepad, args.gamepad)]
-    return operators + [kind(controller, address) for kind, address in devices if address]
-
-
-def chirp(args: argparse.Namespace, policy: Any) -> Any:
-    """Return sweeps in place of a policy, once the operator has said that the robot hangs; with sim it does."""
-    from legged_torque.runtime.chirp import Chirp, confirm
-
-    sweeps = Chirp(policy, args.rate, args.chirp)
-    if args.interface != "sim":
-        confirm()
-    return sweeps
 
 
 def connect(args: argparse.Namespace, policy: Any) -> Any:
