@@ -7,17 +7,14 @@ Examples:
 The policy is kept where ``train.py`` looks for it, which also makes it itself if it is missing.
 """
 
-import argparse
 import shlex
 from pathlib import Path
-from typing import Any
 
 from legged_torque.envs import task_registry
 from legged_torque.utils import cli
 from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import without_machine, write_json
-from legged_torque.utils.options import Options
 
 
 def main() -> None:
@@ -39,21 +36,14 @@ def main() -> None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
     options = cli.options_of(args)
     with cli.slow_imports():
-        cfgs = task_registry.get_cfgs(options.task, options)
+        env_cfg, train_cfg = task_registry.get_cfgs(options.task, options)
+        from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
         from legged_torque.paper.gravity.trials import check_standing
         from legged_torque.utils.progress import CompileProgress
     if args.check_standing:
         with CompileProgress():
-            check_standing(options, *cfgs)
-    else:
-        pretrain(args, options, *cfgs)
-
-
-def pretrain(args: argparse.Namespace, options: Options, env_cfg: Any, train_cfg: Any) -> None:
-    """Make the policy, print what it learned, and the command that trains from it."""
-    from legged_torque.paper.gravity.pretrained import make_pretrained, pretrained_file
-    from legged_torque.utils.progress import CompileProgress
-
+            check_standing(options, env_cfg, train_cfg)
+        return
     file, device = pretrained_file(options.task, train_cfg, options.log_root), resolve_device(options.device)
     if args.json:
         cli.check_output(args.json)
