@@ -28,16 +28,14 @@ def main() -> None:
     parser = cli.Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
-    help_text = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
-    parser.add_argument("--device", default="auto", help=help_text)
-    help_text = (
-        f"runs at a time on each device; default: {GPU_JOBS} on a GPU, {MPS_JOBS} with --mps, {CPU_JOBS} on the CPU"
-    )
-    parser.add_argument("--jobs", type=int, help=help_text)
-    help_text = "let runs on a GPU compute at once instead of in turns, by NVIDIA's Multi-Process Service"
-    parser.add_argument("--mps", action="store_true", help=help_text)
-    help_text = "where runs are started: on this machine (local), or on the machines of a Ray cluster (ray)"
-    parser.add_argument("--launcher", default="local", help=help_text)
+    hint = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
+    parser.add_argument("--device", default="auto", help=hint)
+    hint = f"runs at a time on each device; default: {GPU_JOBS} on a GPU, {MPS_JOBS} with --mps, {CPU_JOBS} on the CPU"
+    parser.add_argument("--jobs", type=int, help=hint)
+    hint = "let runs on a GPU compute at once instead of in turns, by NVIDIA's Multi-Process Service"
+    parser.add_argument("--mps", action="store_true", help=hint)
+    hint = "where runs are started: on this machine (local), or on the machines of a Ray cluster (ray)"
+    parser.add_argument("--launcher", default="local", help=hint)
     parser.add_argument("--address", help="of the Ray cluster; default: auto, the one that this machine belongs to")
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     cli.add_options(parser, "task_file")

@@ -31,9 +31,8 @@ def main() -> None:
     parser = cli.Parser(__doc__)
     parser.add_argument("file", type=Path, help="MJCF or URDF; its meshes are used if they are near it")
     parser.add_argument("--name", default="", help="name of the robot; default: that of the file")
-    parser.add_argument(
-        "--out", type=Path, help="folder for both files; default: the current one, or a clone's own places"
-    )
+    hint = "folder for both files; default: the current one, or a clone's own places"
+    parser.add_argument("--out", type=Path, help=hint)
     parser.add_argument("--torque_limit", type=float, help="[N m] of all joints; default: those of the file")
     parser.add_argument("--check", action="store_true", help="also draw a picture of it, after 5 s in the nominal pose")
     parser.add_argument("--force", action="store_true", help="write over files that exist")

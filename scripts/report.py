@@ -16,14 +16,13 @@ def main() -> None:
     """Read the results, draw figures, write tables and the report: as Markdown, and as one page for a browser."""
     parser = cli.Parser(__doc__)
     parser.add_argument("experiment", type=Path, help="folder of experiment.py's results, or with runs of train.py")
-    help_text = "folder for the report, its tables and figures; default: report, in the folder of the results"
-    parser.add_argument("--out", type=Path, help=help_text)
-    help_text = (
-        "step from which evaluations count; default: the last 18%% of a training: from 90 of 110 million, as in Table I"
-    )
-    parser.add_argument("--from_step", type=float, help=help_text)
-    help_text = "folder with videos <task>.mp4, .webm or .gif, to be shown in the page"
-    parser.add_argument("--videos", type=Path, help=help_text)
+    hint = "folder for the report, its tables and figures; default: report, in the folder of the results"
+    parser.add_argument("--out", type=Path, help=hint)
+    hint = "step from which evaluations count; default: the last 18%% of a training: "
+    hint += "from 90 of 110 million, as in Table I"
+    parser.add_argument("--from_step", type=float, help=hint)
+    hint = "folder with videos <task>.mp4, .webm or .gif, to be shown in the page"
+    parser.add_argument("--videos", type=Path, help=hint)
     args = parser.parse_args()
     cli.check_args(args, from_step=NotNegative)
     out = args.out or path_inside(args.experiment, "report")
