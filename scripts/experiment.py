@@ -40,7 +40,10 @@ def main() -> None:
     parser.add_argument("--dry-run", action="store_true", help="only list what is left to do")
     cli.add_options(parser, "task_file")
     args = parser.parse_args()
-    check_exists(args.file)
+    folders = [args.file.parent, *([EXPERIMENTS_DIR] if args.file.parts[:1] == ("experiments",) else [])]
+    others = {str(args.file.parent / other.name) for folder in folders for other in folder.glob("*.yaml")}
+    if others and not experiment_path(args.file).exists():
+        raise unknown_name("file", str(args.file), others)
     with cli.slow_imports():
         matrix = read_matrix(experiment_path(args.file), args.task_file)
     out = (args.out or Path("logs", "experiments", args.file.stem)).resolve()
@@ -60,14 +63,6 @@ def main() -> None:
         claim_folder(matrix, experiment_path(args.file), out)
         status = ExperimentRun(matrix, out, launcher).run()
     sys.exit(status)
-
-
-def check_exists(file: Path) -> None:
-    """Raise a UserError with the nearest names if there is no such description, but others in its folder."""
-    folders = [file.parent, *([EXPERIMENTS_DIR] if file.parts[:1] == ("experiments",) else [])]
-    others = {str(file.parent / other.name) for folder in folders for other in folder.glob("*.yaml")}
-    if others and not experiment_path(file).exists():
-        raise unknown_name("file", str(file), others)
 
 
 def make_launcher(args: argparse.Namespace) -> Launcher:

@@ -7,7 +7,6 @@ Minutes on a CPU. Train with what it found: train.py --motors chirp_motors.yaml.
 such a log, and what the numbers are worth.
 """
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ from legged_torque.utils.plain_yaml import dump_yaml
 UNITS = ("kg m^2", "N m s/rad", "N m", "rad")
 
 
-def parse_args() -> argparse.Namespace:
-    """Parse and check the command line."""
+def main() -> None:
+    """Fit, print and write."""
     parser = cli.Parser(__doc__)
     parser.add_argument("log", type=Path, help="MCAP file of deploy.py --log")
     parser.add_argument("--out", type=Path, help="YAML file for --motors; default: the log's name with _motors.yaml")
@@ -37,12 +36,6 @@ def parse_args() -> argparse.Namespace:
         raise UserError(f"--out must end in {' or '.join(MOTOR_FILES)}, which --motors reads, not '{args.out}'")
     for file in filter(None, (args.out, args.json)):
         cli.check_output(file)
-    return args
-
-
-def main() -> None:
-    """Fit, print and write."""
-    args = parse_args()
     cli.options_of(args)  # imports files of tasks
     with cli.slow_imports():
         from legged_torque.identification.fit import ROUNDS, identify

@@ -8,7 +8,6 @@ Examples:
     python scripts/publish.py logs/a1_torque_multihead/RUN/exported_1119 --out published --push owner/name
 """
 
-import argparse
 import re
 import shlex
 import shutil
@@ -49,8 +48,8 @@ SHOWN = ("track_percentage", "falls_per_minute", "cost_of_transport")  # the col
 NEEDED = ("policy", "task", "steps")  # of a card, in README
 
 
-def parse_args() -> argparse.Namespace:
-    """Parse and check the command line."""
+def main() -> None:
+    """Write the folder, and upload it if asked to."""
     parser = cli.Parser(__doc__)
     parser.add_argument("policy", type=Path, help="folder of policy.yaml and policy.onnx, or a bundled policy")
     parser.add_argument("--out", type=Path, default=Path("published"), help="new folder; default: %(default)s")
@@ -59,12 +58,6 @@ def parse_args() -> argparse.Namespace:
     if args.out.exists():
         raise UserError(f"'{args.out}' exists: --out must be a new folder")
     cli.check_output(args.out / CARD)
-    return args
-
-
-def main() -> None:
-    """Write the folder, and upload it if asked to."""
-    args = parse_args()
     no_renderer = choose_offscreen_renderer()
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy
@@ -122,18 +115,14 @@ def copy_policy(network: Path, folder: Path, description: dict[str, Any]) -> dic
     if (run / CONFIG_FILE).is_file() and (run / training["checkpoint"]).is_file():
         from legged_torque.learning import checkpoint
 
-        settings = portable_settings(load_config(run))
+        config = load_config(run)
+        words = shlex.split(config.get("command", ""))
+        command = shlex.join(ABSOLUTE.sub(lambda found: portable_path(found[0]), word) for word in words)
+        settings = without_machine(config) | {"command": command}  # no folders of this machine, also in its command
         write_whole(folder / CONFIG_FILE, dump_yaml(settings, explicit_start=True, explicit_end=True))
         checkpoint.write_actor(run / training["checkpoint"], folder)
-        card["trained"] = settings["command"]
+        card["trained"] = command
     return card
-
-
-def portable_settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a run's config.yaml without the folders of this machine, also in its command."""
-    words = shlex.split(config.get("command", ""))
-    command = shlex.join(ABSOLUTE.sub(lambda found: portable_path(found[0]), word) for word in words)
-    return without_machine(config) | {"command": command}
 
 
 def write_cards(folder: Path, card: dict[str, Any]) -> None:

@@ -5,7 +5,6 @@ Examples:
     python scripts/replay.py walk.mcap --policy exported --motors real --latency 5 --plot gap.png
 """
 
-import argparse
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,8 +15,8 @@ from legged_torque.utils.limits import Limits, Positive
 from legged_torque.utils.options import simulated_latency
 
 
-def parse_args() -> argparse.Namespace:
-    """Parse and check the command line."""
+def main() -> None:
+    """Print what has become of policy and robot."""
     parser = cli.Parser(__doc__)
     parser.add_argument("log", type=Path, help="MCAP file of deploy.py --log")
     parser.add_argument("--policy", type=Path, required=True, help="policy.yaml, policy.onnx, or the folder of both")
@@ -33,12 +32,6 @@ def parse_args() -> argparse.Namespace:
         cli.check_output(args.plot)
         if args.plot.suffix not in (".png", ".svg", ".pdf"):
             raise UserError(f"cannot write '{args.plot}': a figure needs a name that ends in .png, .svg or .pdf")
-    return args
-
-
-def main() -> None:
-    """Print what has become of policy and robot."""
-    args = parse_args()
     cli.options_of(args)  # imports files of tasks
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy

@@ -6,7 +6,6 @@ Examples:
     python scripts/sim_robot.py --fault lost=0.3 --fault_at 20    # of whose messages a third is lost after 20 s
 """
 
-import argparse
 import contextlib
 import dataclasses
 import math
@@ -27,8 +26,8 @@ LINE_EVERY = 1.0  # seconds between two lines of the state
 FRAME = 1 / 60  # seconds between two drawings
 
 
-def parse_args() -> argparse.Namespace:
-    """Parse and check the command line."""
+def main() -> None:
+    """Simulate until the end, and print a line now and then."""
     parser = cli.Parser(__doc__)
     parser.add_argument("--robot", choices=tuple(TASKS), default="go2", help="default: %(default)s")
     parser.add_argument("--interface", default="lo", help="network interface; default: %(default)s")
@@ -44,12 +43,6 @@ def parse_args() -> argparse.Namespace:
     args = parser.parse_args()
     limits = {"domain": Annotated[int, Limits(0, 232)], "latency": Annotated[float, Limits(0, 1000)]}
     cli.check_args(args, seconds=Positive, fault_at=NotNegative, **limits)
-    return args
-
-
-def main() -> None:
-    """Simulate until the end, and print a line now and then."""
-    args = parse_args()
     with cli.slow_imports():
         from legged_torque.envs import task_registry
         from legged_torque.runtime.dds import Go2Side
