@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 from legged_torque.experiments.job import LOST
 from legged_torque.experiments.local_launcher import GPU_JOBS, Jobs
 from legged_torque.experiments.matrix import Cell, CellState, Matrix, last_checkpoint, step_words
-from legged_torque.experiments.ray_node import Files, NodeStep, Report, is_checkpoint, versions_here, write_files
+from legged_torque.experiments.ray_node import NodeStep, Report, is_checkpoint, versions_here, write_files
 from legged_torque.learning.worlds import remove_older_worlds, worlds_file
 from legged_torque.utils.errors import UserError, require
 from legged_torque.utils.limits import check_value
@@ -52,7 +52,12 @@ class RayLauncher:
         words = step_words(matrix, replace(cell, folder=Path(cell.name)), state, self.device)
         share = 1.0 / self._per_gpu if self._per_gpu else 0.0
         actor = self._ray.remote(NodeStep).options(num_cpus=1, num_gpus=share).remote()
-        first = actor.start.remote(words, needed_files(cell), versions_here(), self.device)
+        out, newest = cell.folder.parent, last_checkpoint(cell)
+        needed = [out / PRETRAINED / f"{cell.task}.pt"]
+        if newest:
+            needed = [newest, worlds_file(newest), newest.with_name(CONFIG_FILE)]
+        files = {file.relative_to(out).as_posix(): file.read_bytes() for file in needed if file.is_file()}
+        first = actor.start.remote(words, files, versions_here(), self.device)
         return RayProcess(actor, first, cell, Path(log.name))
 
 
@@ -137,12 +142,3 @@ def join_cluster(address: str) -> Any:
         hint = "start one with 'ray start --head'"
         raise UserError(f"there is no Ray cluster at address '{address}' ({hint}): {reason}") from None
     return ray
-
-
-def needed_files(cell: Cell) -> Files:
-    """Return the files that a cell's next step needs."""
-    out, newest = cell.folder.parent, last_checkpoint(cell)
-    files = [out / PRETRAINED / f"{cell.task}.pt"]
-    if newest:
-        files = [newest, worlds_file(newest), newest.with_name(CONFIG_FILE)]
-    return {file.relative_to(out).as_posix(): file.read_bytes() for file in files if file.is_file()}

@@ -48,7 +48,11 @@ class NodeStep:
         address = ray.util.get_node_ip_address()
         gpus = ray.get_runtime_context().get_accelerator_ids().get("GPU", [])
         place = f"{address} cuda:{gpus[0]}" if gpus else f"{address} {device}"
-        check_versions(f"{address} ({socket.gethostname()})", versions, versions_here())
+        found = versions_here()
+        for name, version in versions.items():
+            if found.get(name) != version:
+                differs = f"has {name} {found.get(name, 'not at all')}, this one has {version}"
+                raise UserError(f"the machine {address} ({socket.gethostname()}) {differs}")
         remove_stale_parts(Path(tempfile.gettempdir()))  # folders of steps whose actors were killed
         self._folder = tempfile.TemporaryDirectory(prefix="legged_torque_", suffix=part_of(Path("_")).name)
         root, self._sent, self._reported_at = Path(self._folder.name), dict[str, Version](), time.monotonic()
@@ -122,11 +126,3 @@ def versions_here() -> dict[str, str]:
     versions = package_versions() | {"code of legged_torque": digest.hexdigest()[:12]}
     del versions["legged_torque"]  # says less
     return versions
-
-
-def check_versions(machine: str, wanted: dict[str, str], found: dict[str, str]) -> None:
-    """Refuse a machine with another version of anything, by UserError."""
-    for name, version in wanted.items():
-        if found.get(name) != version:
-            other = found.get(name, "not at all")
-            raise UserError(f"the machine {machine} has {name} {other}, this one has {version}")

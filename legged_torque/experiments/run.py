@@ -208,13 +208,8 @@ def bars() -> Progress:
     """Return a display of bars with notes, which is shown on a terminal only."""
     name = TextColumn("{task.description}", table_column=Column(no_wrap=True, overflow="ellipsis", ratio=1))
     columns = (name, BarColumn(20), TaskProgressColumn(), TextColumn("{task.fields[note]}"))
-    how: dict[str, Any] = {
-        "auto_refresh": False,
-        "transient": True,
-        "expand": True,
-        "speed_estimate_period": SPEED_OVER,
-    }
-    return Progress(*columns, console=Console(highlight=False), disable=not is_terminal(sys.stdout), **how)
+    how: dict[str, Any] = {"console": Console(highlight=False), "disable": not is_terminal(sys.stdout), "expand": True}
+    return Progress(*columns, auto_refresh=False, transient=True, speed_estimate_period=SPEED_OVER, **how)
 
 
 def claim_folder(matrix: Matrix, file: Path, out: Path) -> None:
