@@ -132,22 +132,17 @@ def check(description: Any, where: str = DESCRIPTION_FILE) -> None:
         for key, limits in description[section].items():
             if isinstance(limits, list) and len(limits) == 2 and limits[0] > limits[1]:
                 raise UserError(f"{where}: {section}.{key} must be [lowest, highest], not {limits}")
-    _check_sizes(description, where)
-    timing = description["timing"]
-    if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
-        raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
-
-
-def _check_sizes(description: dict[str, Any], where: str) -> None:
-    """Check that terms have the sizes of their scales, and together those of the network; a UserError."""
     network, terms = description["network"], description["actions"]["terms"]
     for term in description["observations"]["terms"]:
         if isinstance(term["scale"], list) and len(term["scale"]) != term["size"]:
             raise UserError(f"{where}: the scale of the observation '{term['name']}' must have {term['size']} numbers")
-    sizes = (len(columns(description["observations"])), len(terms) * len(description["joint_order"]))
-    for kind, size in zip(("observations", "actions"), sizes, strict=True):
+    sizes = {"observations": len(columns(description["observations"])), "actions": len(terms) * len(joints)}
+    for kind, size in sizes.items():
         if size != network[f"num_{kind}"]:
             raise UserError(f"{where}: {kind} have {size} numbers, those of the network {network[f'num_{kind}']}")
+    timing = description["timing"]
+    if not math.isclose(timing["physics_frequency"], timing["control_frequency"] * timing["decimation"], rel_tol=1e-6):
+        raise UserError(f"{where}: timing.physics_frequency is not control_frequency times decimation")
 
 
 def _check_schema(description: Any, where: str) -> None:

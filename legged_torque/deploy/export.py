@@ -274,8 +274,10 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         description["copper_loss"] = _by_joint(task, task.meter.copper_loss)
     if latency := _latency(task, description["motors"]):
         description["latency"] = latency
-    if others := _not_simulated(task):
-        description["episode"]["not_simulated"] = others
+    others = [f"commands.{name}" for name in ("standing_share", "zero_below") if getattr(commands, name)]
+    others += ["commands.build"] if type(task.command_generator) is not UniformCommands else []
+    if others := others + [f"terminations.{name}" for name in task.terminations if name != "contact"]:
+        description["episode"]["not_simulated"] = others  # in sim2sim.py
     if cfg.terrain.mesh_type == "heightfield":
         description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
     return description
@@ -301,14 +303,6 @@ def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:
         settings: Any = task.cfg.sensing.delay
         latency["measurements"] = settings.described()
     return latency
-
-
-def _not_simulated(task: LeggedRobot) -> list[str]:
-    """Return settings by which commands and episodes of the training differ from those of sim2sim.py."""
-    commands = task.cfg.commands
-    named = [f"commands.{name}" for name in ("standing_share", "zero_below") if getattr(commands, name)]
-    named += ["commands.build"] if type(task.command_generator) is not UniformCommands else []
-    return named + [f"terminations.{name}" for name in task.terminations if name != "contact"]
 
 
 def _observation_terms(task: LeggedRobot, model: MLPModel) -> list[dict[str, Any]]:
@@ -389,11 +383,10 @@ def differences(task: LeggedRobot, model: MLPModel, policy: Policy) -> list[str]
         ("heights of the scan", seen[:, is_scan], expected[:, is_scan], SCAN_TOLERANCE),
         ("torques", np.array(torques), task.torques.cpu().numpy(), TOLERANCE),
     ]
-    found = [(name, _difference(ours, theirs), tolerance) for name, ours, theirs, tolerance in compared]
     return [
         f"the {name} of {type(task).__name__} differ by {difference:.3g} from those of the terms in policy.yaml"
-        for name, difference, tolerance in found
-        if not difference <= tolerance
+        for name, ours, theirs, tolerance in compared
+        if not (difference := _difference(ours, theirs)) <= tolerance
     ]
 
 
