@@ -8,7 +8,6 @@ import numpy as np
 import viser
 from numpy.typing import ArrayLike
 
-from legged_torque.envs.base.asset import Asset
 from legged_torque.utils.metrics import UNITS
 from legged_torque.utils.mjcf import joint_limits
 from legged_torque.viewer.session import HISTORY_STEPS, Session
@@ -40,7 +39,9 @@ class Plots:
         self._legs = joints_by_leg(task.dof_names, task.cfg.asset.mirrored_legs)
         self._torque_limits = task.torque_limits.cpu().numpy()
         self._angle_limits = joint_limits(task.sim.mj_model)[1:].T
-        self._feet, self._terms = foot_labels(task.asset), task.reward_names
+        feet = [task.asset.foot_names[task.asset.foot_of.index(foot)] for foot in dict.fromkeys(task.asset.foot_of)]
+        words = [name.split("_")[0] for name in feet]  # a foot may have several geoms, of which this names one
+        self._feet, self._terms = words if len(set(words)) == len(words) else feet, task.reward_names
         self._parts = list(zip((name.replace("_", " ") for name in session.mixing), cycle(PARTS), strict=False))
         self._has_targets = any(term.name == PD_CONTROL for term in task.control_law.terms)
         seconds, panel = HISTORY_STEPS * task.dt, gui.add_panel()
@@ -140,13 +141,6 @@ class Plots:
             color = REWARD if value > 0 else PENALTY
             rows.append(bars_html(name.replace("_", " "), [value / largest], [color], f"{value:+.3f}", "lt-wide"))
         return block_html(f"<b>Weighted terms [1/s]; their sum: {rewards.sum():+.3f}</b>", rows)
-
-
-def foot_labels(asset: Asset) -> list[str]:
-    """Return a name for each foot, which may have several geoms: the first word of one, if that makes a difference."""
-    names = [asset.foot_names[asset.foot_of.index(foot)] for foot in dict.fromkeys(asset.foot_of)]
-    words = [name.split("_")[0] for name in names]
-    return words if len(set(words)) == len(words) else names
 
 
 def joints_by_leg(joints: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -> dict[str, list[int]]:
