@@ -4,7 +4,6 @@ import os
 
 os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to standard error when it starts
 
-import argparse
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,18 @@ LEGEND = """\
 
 def main() -> None:
     """Measure every size, print tables, write JSON."""
-    args = parse_args()
+    parser = cli.Parser(__doc__)
+    cli.add_options(parser, *cli.SETTINGS)
+    parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
+    parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
+    parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
+    parser.add_argument("--json", type=Path, help="file to write")
+    hint = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
+    parser.add_argument("--profile", type=Path, help=hint)
+    args = parser.parse_args()
+    cli.check_args(args, rounds=Count)
+    if args.profile and len(args.num_envs or [None]) > 1:
+        raise UserError("--profile writes one trace: give one number of worlds")
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
     with cli.slow_imports():
@@ -74,23 +84,6 @@ def main() -> None:
             print(*row["profile"], f"The trace is in {args.profile}; Warp's kernels show on a GPU only.", sep="\n")
         if args.json:
             write_json(args.json, result | {"rows": rows})
-
-
-def parse_args() -> argparse.Namespace:
-    """Parse and check the command line."""
-    parser = cli.Parser(__doc__)
-    cli.add_options(parser, *cli.SETTINGS)
-    parser.add_argument("--num_envs", type=int, nargs="+", help="numbers of worlds; default: that of the task")
-    parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
-    parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
-    parser.add_argument("--json", type=Path, help="file to write")
-    hint = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
-    parser.add_argument("--profile", type=Path, help=hint)
-    args = parser.parse_args()
-    cli.check_args(args, rounds=Count)
-    if args.profile and len(args.num_envs or [None]) > 1:
-        raise UserError("--profile writes one trace: give one number of worlds")
-    return args
 
 
 if __name__ == "__main__":

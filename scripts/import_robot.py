@@ -9,7 +9,7 @@ import importlib.util
 import io
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from legged_torque import RESOURCES_DIR
 from legged_torque import __file__ as package
@@ -19,9 +19,6 @@ from legged_torque.utils.devices import choose_offscreen_renderer, disable_rende
 from legged_torque.utils.errors import UserError, collect_errors, printable
 from legged_torque.utils.files import write_whole
 from legged_torque.utils.limits import Limits
-
-if TYPE_CHECKING:
-    import mujoco
 
 Torque = Annotated[float, Limits(above=0, highest=1e5)]
 
@@ -82,22 +79,19 @@ def main() -> None:
     print(f"wrote {model_file}\nwrote {code_file}")
     print(*problems or ["sim.engine 'fused' simulates it"])
     print(f"5 s under PD: {verdict}")
-    if args.check:
-        print(f"no picture: {no_picture}" if no_picture else draw(data, folder / f"{robot.name}.png"))
+    if args.check and no_picture:
+        print(f"no picture: {no_picture}")
+    elif args.check:
+        from PIL import Image
+
+        picture, content = folder / f"{robot.name}.png", io.BytesIO()
+        with mujoco.Renderer(model, 480, 640) as renderer:
+            renderer.update_scene(data, camera="track")
+            Image.fromarray(renderer.render()).save(content, format="png")
+        write_whole(picture, content.getvalue())
+        print(f"wrote {picture}")
     task_file = "" if is_inside else f"--task_file {shlex.quote(str(code_file))} "
     print(f"Train it: {cli.script_command('train')} {task_file}--task={robot.name}_position")
-
-
-def draw(data: "mujoco.MjData", file: Path) -> str:
-    """Draw a robot into a file; return a line that says so."""
-    import mujoco
-    from PIL import Image
-
-    with mujoco.Renderer(data.model, 480, 640) as renderer:
-        renderer.update_scene(data, camera="track")
-        Image.fromarray(renderer.render()).save(picture := io.BytesIO(), format="png")
-    write_whole(file, picture.getvalue())
-    return f"wrote {file}"
 
 
 if __name__ == "__main__":

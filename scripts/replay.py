@@ -6,7 +6,7 @@ Examples:
 """
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from legged_torque import resource_path
 from legged_torque.utils import cli
@@ -42,9 +42,9 @@ def main() -> None:
         from legged_torque.runtime.sim_robot import SimRobot
 
         if args.plot:
-            from legged_torque.paper.plotting import load_pyplot
+            from legged_torque.paper.plotting import load_pyplot, save_figure
 
-            load_pyplot()  # a UserError if it is missing
+            pyplot = load_pyplot()  # a UserError if it is missing
     log, policy = RecordedLog(args.log), Policy(args.policy)
     hangs = log.sha256 == CHECKSUM  # sweeps in place of a policy
     if hangs and log.task != (task := policy.description["task"]):
@@ -64,24 +64,17 @@ def main() -> None:
     for name, at, rms in zip(log.joint_order, parts, gap.rms(until), strict=True):
         print(f"  {name}: {'never' if at == float('inf') else f'{at:.2f}'}; {rms:.4f}")
     if args.plot:
-        plot(gap, log.joint_order, args.plot)
-
-
-def plot(gap: Any, names: list[str], file: Path) -> None:
-    """Draw positions of all joints, logged and simulated."""
-    from legged_torque.paper.plotting import load_pyplot, save_figure
-
-    size = {"figsize": (12, 8), "layout": "constrained"}
-    figure, axes = load_pyplot().subplots(-(-len(names) // 3), 3, sharex=True, squeeze=False, **size)
-    for axis, name, logged, simulated in zip(axes.flat, names, gap.logged.T, gap.simulated.T, strict=False):
-        axis.plot(gap.times, logged, label="log")
-        axis.plot(gap.times, simulated, label="simulated", linestyle="--")
-        axis.set_title(name, fontsize="small")
-    axes.flat[0].legend()
-    figure.supxlabel("time [s]")
-    figure.supylabel("joint position [rad]")
-    save_figure(figure, file)
-    print(f"wrote {file}")
+        names, size = log.joint_order, {"figsize": (12, 8), "layout": "constrained"}
+        figure, axes = pyplot.subplots(-(-len(names) // 3), 3, sharex=True, squeeze=False, **size)
+        for axis, name, logged, simulated in zip(axes.flat, names, gap.logged.T, gap.simulated.T, strict=False):
+            axis.plot(gap.times, logged, label="log")
+            axis.plot(gap.times, simulated, label="simulated", linestyle="--")
+            axis.set_title(name, fontsize="small")
+        axes.flat[0].legend()
+        figure.supxlabel("time [s]")
+        figure.supylabel("joint position [rad]")
+        save_figure(figure, args.plot)
+        print(f"wrote {args.plot}")
 
 
 if __name__ == "__main__":
