@@ -37,8 +37,5 @@ def select_tiles(settings: Any, kinds: Sequence[str], levels: Sequence[float], c
     if levels:
         settings.num_rows, settings.difficulties = len(levels), list(levels)
     proportions = settings.terrain_proportions
-    for kind in section_keys(proportions):
-        setattr(proportions, kind, 0.0)
-    for kind in kinds:
-        setattr(proportions, kind, 1.0 / len(kinds))
+    vars(proportions).update(dict.fromkeys(section_keys(proportions), 0.0) | dict.fromkeys(kinds, 1.0 / len(kinds)))
     proportions._names = section_keys(proportions)  # also those that the task does not declare
