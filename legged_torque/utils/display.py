@@ -193,8 +193,7 @@ def duration(seconds: float) -> str:
 def warn(text: str) -> None:
     """Print a warning on standard error; a view that is shown counts it."""
     print(f"Warning: {text}.", file=sys.stderr, flush=True)
-    shown = Display.shown
-    if shown is not None:
+    if (shown := Display.shown) is not None:
         shown.warnings += (text,)
 
 

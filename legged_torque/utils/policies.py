@@ -35,7 +35,9 @@ def policy_dir(name: str, checkpoint: int | None = None) -> Path:
     if name.startswith(WANDB):
         return download_run(name.removeprefix(WANDB), checkpoint)
     if name.startswith(HUB):
-        folder = download(name.removeprefix(HUB))
+        kinds = [CARD, "config.yaml", "policy.onnx", "policy.yaml", "model_*.pt"]  # as publish.py --push uploads
+        with _client("huggingface_hub", "hub", f"cannot download the policy '{name}'") as client:
+            folder = Path(client.HfApi().snapshot_download(name.removeprefix(HUB), allow_patterns=kinds))
     else:
         check_names("policy", [name], policy_names())
         folder = POLICIES_DIR / name
@@ -43,13 +45,6 @@ def policy_dir(name: str, checkpoint: int | None = None) -> Path:
         if not (folder / file).is_file() or sha256(folder / file) != checksum:
             raise UserError(f"'{folder / file}' is not the file that {CARD} describes")
     return folder
-
-
-def download(repository: str) -> Path:
-    """Return a copy of a model of the Hub, as ``publish.py --push`` has uploaded it; a UserError if there is none."""
-    kinds = [CARD, "config.yaml", "policy.onnx", "policy.yaml", "model_*.pt"]
-    with _client("huggingface_hub", "hub", f"cannot download the policy '{HUB}{repository}'") as client:
-        return Path(client.HfApi().snapshot_download(repository, allow_patterns=kinds))
 
 
 def download_run(path: str, checkpoint: int | None) -> Path:

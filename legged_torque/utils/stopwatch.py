@@ -1,5 +1,6 @@
 """Where the seconds of a command go, by stage: ``train.py --timing`` prints it."""
 
+import contextlib
 import os
 import time
 from pathlib import Path
@@ -13,9 +14,12 @@ class Stopwatch:
     """
 
     def __init__(self) -> None:
-        """Begin with the first stage."""
+        """Begin with the first stage, where the process began; now, where the system has no ``/proc`` to say when."""
         self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter() - _process_age()
+        self._last = time.perf_counter()
+        with contextlib.suppress(OSError, AttributeError):
+            began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+            self._last -= time.clock_gettime(time.CLOCK_BOOTTIME) - began
 
     def lap(self, stage: str) -> None:
         """End a stage: it has the time since the end of the one before. It may go on later."""
@@ -26,15 +30,6 @@ class Stopwatch:
     def __str__(self) -> str:
         """List all stages."""
         return ", ".join(f"{stage} {seconds:.1f} s" for stage, seconds in self.seconds.items())
-
-
-def _process_age() -> float:
-    """Return the seconds since this process began; 0 where the system has no ``/proc`` to say so."""
-    try:
-        began = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
-        return time.clock_gettime(time.CLOCK_BOOTTIME) - began
-    except (OSError, AttributeError):
-        return 0.0
 
 
 stopwatch = Stopwatch()
