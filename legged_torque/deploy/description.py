@@ -37,7 +37,13 @@ def read(path: str | Path) -> tuple[dict[str, Any], Path]:
     file = folder / DESCRIPTION_FILE if path.is_dir() or is_network else path
     network = path if is_network else folder / NETWORK_FILE
     if network.is_file() and not file.exists():
-        return _described_by(network), network
+        session, checksum = open_network(network)
+        description = from_metadata(session.get_modelmeta().custom_metadata_map, f"'{network}'")
+        if not isinstance(description.get("network"), dict):  # it is not of export.py, or of an older one
+            raise UserError(f"there is no {DESCRIPTION_FILE} in '{folder}', and '{network}' does not describe itself")
+        description["network"]["sha256"] = checksum
+        check(description, f"'{network}'")
+        return description, network
     try:
         text = file.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -95,17 +101,6 @@ def open_network(file: Path) -> tuple[Any, str]:
     except Exception as error:  # onnxruntime has an exception class per kind of damage
         raise UserError(f"'{file}' is not a readable network: {' '.join(str(error).split())[:160]}") from None
     return session, hashlib.sha256(content).hexdigest()
-
-
-def _described_by(file: Path) -> dict[str, Any]:
-    """Return the checked description that a network holds; a UserError if it holds none."""
-    session, checksum = open_network(file)
-    description = from_metadata(session.get_modelmeta().custom_metadata_map, f"'{file}'")
-    if not isinstance(description.get("network"), dict):  # as in those that are not of export.py, or of an older one
-        raise UserError(f"there is no {DESCRIPTION_FILE} in '{file.parent}', and '{file}' does not describe itself")
-    description["network"]["sha256"] = checksum
-    check(description, f"'{file}'")
-    return description
 
 
 def columns(observations: dict[str, Any]) -> list[str]:
