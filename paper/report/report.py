@@ -4,6 +4,7 @@ import base64
 import gzip
 import re
 from datetime import timedelta
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from legged_torque.paper.report.evaluations import MILLION
 from legged_torque.paper.report.experiment import LAST_SHARE, Experiment, Training, is_of_paper
 from legged_torque.paper.report.figures import draw_all, file_name, planned_figures, rough_figures
 from legged_torque.paper.report.figures_curves import FEW
-from legged_torque.paper.report.robustness import condition_table, find_sweeps, findings, sweep_figures
+from legged_torque.paper.report.robustness import condition_table, draw_sweep, find_sweeps, findings
 from legged_torque.paper.report.style import in_words, method, name_of
 from legged_torque.paper.report.tables import BETTER, WITHIN, WORSE, summarize
 from legged_torque.paper.report.unplanned import differing
@@ -50,10 +51,13 @@ def write_report(experiment: Experiment, from_step: float, out: Path, videos: di
         How many figures there are, and how many lines on what is missing.
     """
     table = summarize(experiment, from_step)
-    differences, configs = tables.find_differences(experiment, table), first_configs(experiment)
+    differences, environment = tables.find_differences(experiment, table), next(iter(experiment.plan.environments))
+    first = {task: experiment.runs_of(task, environment) for task in experiment.plan.tasks}
+    configs = {task: without_machine(some[0].configs[-1]) for task, some in first.items() if some and some[0].configs}
     planned, rough = planned_figures(experiment, table, differences), rough_figures(experiment)
     sweeps = find_sweeps(experiment)
-    drawn = draw_all(experiment, planned | rough | sweep_figures(experiment, sweeps), out)
+    swept = {title: partial(draw_sweep, experiment.plan.tasks, sweep) for title, sweep in sweeps.items()}
+    drawn = draw_all(experiment, planned | rough | swept, out)
     signs = {name: int((table["sign"] == sign).sum()) for sign, name in CLASSES.items()}
     values = {
         "title": f"Results of {experiment.folder.resolve().name}",
@@ -172,13 +176,6 @@ def setup_lines(experiment: Experiment) -> list[str]:
             "were slower for it"
         )
     return lines
-
-
-def first_configs(experiment: Experiment) -> dict[str, dict[str, Any]]:
-    """Return the settings of the first training of each task in the first environment."""
-    environment = next(iter(experiment.plan.environments))
-    runs = {task: experiment.runs_of(task, environment) for task in experiment.plan.tasks}
-    return {task: without_machine(some[0].configs[-1]) for task, some in runs.items() if some and some[0].configs}
 
 
 def find_videos(folder: Path, tasks: list[str]) -> dict[str, Path]:

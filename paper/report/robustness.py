@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +10,6 @@ import pandas as pd
 
 from legged_torque.paper.plotting import load_pyplot
 from legged_torque.paper.report.experiment import Experiment
-from legged_torque.paper.report.figures import Draw
 from legged_torque.paper.report.style import in_words, method, name_of, style
 from legged_torque.paper.report.tables import SIGNIFICANT, Rows, baseline_of, estimate, estimate_text, holm, welch
 
@@ -88,11 +86,6 @@ def compare(tasks: list[str], values: pd.DataFrame) -> pd.DataFrame:
     p_values = holm([welch(of[key], of[baseline, key[1]]) for key in keys])
     columns = ["values", "iqm", "low", "high", "seeds"]
     return pd.DataFrame(rows, index, columns).assign(is_significant=p_values < SIGNIFICANT)
-
-
-def sweep_figures(experiment: Experiment, sweeps: dict[str, Sweep]) -> dict[str, Draw]:
-    """Return the functions that draw the figures of sweeps, by title."""
-    return {title: partial(draw_sweep, experiment.plan.tasks, sweep) for title, sweep in sweeps.items()}
 
 
 def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
