@@ -36,6 +36,6 @@ def select_tiles(settings: Any, kinds: Sequence[str], levels: Sequence[float], c
     settings.num_cols = columns * len(kinds)
     if levels:
         settings.num_rows, settings.difficulties = len(levels), list(levels)
-    proportions = settings.terrain_proportions
-    vars(proportions).update(dict.fromkeys(section_keys(proportions), 0.0) | dict.fromkeys(kinds, 1.0 / len(kinds)))
+    proportions, shares = settings.terrain_proportions, dict.fromkeys(kinds, 1.0 / max(len(kinds), 1))
+    vars(proportions).update(dict.fromkeys(section_keys(proportions), 0.0) | shares)
     proportions._names = section_keys(proportions)  # also those that the task does not declare
