@@ -78,7 +78,13 @@ def write_page(folder: Path, policy: Policy, title: str) -> list[str]:
     for part in STATIC.iterdir():
         shutil.copy(part, folder)
     for package, (checksum, names) in PACKAGES.items():
-        copy_files(library(package, checksum), names, folder / "vendor")
+        with tarfile.open(fileobj=io.BytesIO(library(package, checksum))) as archive:
+            for name in names:
+                stream = archive.extractfile(f"package/{name}")
+                assert stream  # the archive is the one that was checked
+                place = name.removeprefix("examples/jsm/")  # whose folder the page's import map names
+                file = f"addons/{place}" if place != name else Path(name).name
+                write_whole(folder / "vendor" / file, stream.read())
     return notes
 
 
@@ -136,13 +142,3 @@ def library(package: str, checksum: str) -> bytes:
 def _is_genuine(content: bytes, checksum: str) -> bool:
     """Return whether a file has a sha512 in base64, as npm writes it."""
     return base64.b64encode(hashlib.sha512(content).digest()).decode() == checksum
-
-
-def copy_files(archive: bytes, names: tuple[str, ...], folder: Path) -> None:
-    """Copy files of an npm package; those of three's addons keep their folder, which the page's import map names."""
-    with tarfile.open(fileobj=io.BytesIO(archive)) as opened:
-        for name in names:
-            stream = opened.extractfile(f"package/{name}")
-            assert stream  # the archive is the one that was checked
-            place = name.removeprefix("examples/jsm/")
-            write_whole(folder / (f"addons/{place}" if place != name else Path(name).name), stream.read())
