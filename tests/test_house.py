@@ -24,26 +24,26 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 219,
-    "legged_torque/deploy": 1587,
-    "legged_torque/envs": 5431,
-    "legged_torque/experiments": 1141,
+    "legged_torque/deploy": 1576,
+    "legged_torque/envs": 5455,
+    "legged_torque/experiments": 1128,
     "legged_torque/identification": 459,
     "legged_torque/importer": 1294,
-    "legged_torque/learning": 4491,
-    "legged_torque/motors": 1528,
+    "legged_torque/learning": 4528,
+    "legged_torque/motors": 1557,
     "legged_torque/runtime": 2196,
-    "legged_torque/sensors": 311,
-    "legged_torque/sim": 5940,
-    "legged_torque/terrain": 581,
-    "legged_torque/utils": 3492,
-    "legged_torque/viewer": 2522,
-    "scripts": 2162,
-    "paper": 3243,
+    "legged_torque/sensors": 312,
+    "legged_torque/sim": 5946,
+    "legged_torque/terrain": 580,
+    "legged_torque/utils": 3518,
+    "legged_torque/viewer": 2512,
+    "scripts": 2066,
+    "paper": 3236,
     "tools": 1484,
-    "tests": 27533,
+    "tests": 27783,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 33_399  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 33_391  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

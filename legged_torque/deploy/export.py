@@ -181,21 +181,14 @@ def write_networks(model: MLPModel, obs: TensorDict, folder: Path, description: 
     inputs, outputs = (["obs"] + [each["input"] for each in memory], ["actions"] + [each["output"] for each in memory])
     kept = [torch.zeros(each["layers"], 2, each["size"]) for each in memory]
     axes = {name: {int(name not in ("obs", "actions")): "batch"} for name in inputs + outputs}
+    names: dict[str, Any] = {"input_names": inputs, "output_names": outputs, "dynamic_axes": axes}
     with warnings.catch_warnings():
         # The older exporter needs 0.3 s instead of 6, writes the same nodes, and keeps everything in one file.
         warnings.simplefilter("ignore", DeprecationWarning)
         warnings.filterwarnings("ignore", "Exporting a model to ONNX with a batch_size")  # its memory is an input
         warnings.simplefilter("ignore", torch.jit.TracerWarning)  # torch checks the sizes of that
-        torch.onnx.export(
-            network,
-            (torch.zeros(2, model.obs_dim), *kept),
-            str(folder / NETWORK_FILE),
-            input_names=inputs,
-            output_names=outputs,
-            dynamic_axes=axes,
-            opset_version=17,
-            dynamo=False,
-        )
+        example = (torch.zeros(2, model.obs_dim), *kept)
+        torch.onnx.export(network, example, str(folder / NETWORK_FILE), **names, opset_version=17, dynamo=False)
         (folder / TORCHSCRIPT_FILE).write_bytes(torch.jit.script(model.as_jit().cpu().eval()).save_to_buffer())
     write_description(folder, description)
     steps = torch.randn(NUM_SAMPLES, model.obs_dim, generator=torch.Generator().manual_seed(0))
