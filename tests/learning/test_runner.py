@@ -132,12 +132,13 @@ class Gained(MLPModel):
     """An actor that takes no further settings."""
 
 
+def with_images_alone(env, obs, actions):
+    """Observations and their images, without images of actions."""
+    return torch.cat([obs, obs]), actions
+
+
 def test_classes_that_do_not_fit(make_task, make_runner, tmp_path):
     """Settings that a class does not take, and functions that mirror observations alone, are refused by name."""
-
-    def mirror(env, obs, actions):
-        return torch.cat([obs, obs]), actions
-
     _, cfg = get_cfgs("--task=a1_position")
 
     class Actor(type(cfg.actor)):
@@ -147,7 +148,11 @@ def test_classes_that_do_not_fit(make_task, make_runner, tmp_path):
     cfg.actor = Actor()
     line = error_of(task_registry.make_alg_runner, make_task("a1_position", 4), train_cfg=cfg, log_root=None)
     assert line.startswith("algorithm, actor or critic: ") and "'gain'" in line
-    images = {"use_data_augmentation": True, "use_equivariant_networks": False, "data_augmentation_func": mirror}
+    images = {
+        "use_data_augmentation": True,
+        "use_equivariant_networks": False,
+        "data_augmentation_func": f"{__name__}:with_images_alone",
+    }
     images = {f"algorithm.symmetry_cfg.{name}": value for name, value in images.items()}
     line = error_of(make_runner, "a1_position", log_root=tmp_path, **images)
     assert line == "symmetry_cfg.data_augmentation_func must return as many actions as observations"
