@@ -141,6 +141,25 @@ def test_files_of_no_use(text, told, tmp_path):
     assert task_registry.names() == tasks
 
 
+ALONE = """
+from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, TorqueRobot, task_registry
+
+class Alone(TorqueRobot):
+    def _reward_torques(self):
+        return self.torques.square().mean()
+
+task_registry.register("faulty", Alone, A1TorqueCfg(), A1TorqueCfgPPO())
+"""
+
+
+def test_a_term_of_a_wrong_shape(tmp_path):
+    """It is found before the run has a folder."""
+    (tmp_path / "faulty.py").write_text(ALONE)
+    told = run_here("train.py", "--task_file=faulty.py", "--task=faulty", *SMALL, root=tmp_path)
+    assert_told_in_one_line(told, "reward term 'torques' must be float32 (2,) on cpu, not float32 () on cpu")
+    assert not (tmp_path / "logs").exists()
+
+
 def test_a_name_that_is_taken(tmp_path):
     """A file does not stand in for a module that is installed."""
     (tmp_path / "yaml.py").write_text(REGISTER.format("theirs"))
