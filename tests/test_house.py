@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2066,
     "paper": 3236,
     "tools": 1484,
-    "tests": 27783,
+    "tests": 27807,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 33_391  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
