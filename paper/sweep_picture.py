@@ -60,6 +60,8 @@ def _draw(axis: Axes, sweeps: list[dict[str, Any]], label: str, colour: str) -> 
     from legged_torque.paper.report.experiment import read_sweep  # needs the extra plots
 
     sweep, tables = sweeps[0], [read_sweep(each) for each in sweeps]
+    if any(not table["at"].equals(tables[0]["at"]) for table in tables):
+        raise ValueError("its files have different ranges")
     x, means = tables[0]["at"], np.array([table["value"] for table in tables])
     mean, count = means.mean(axis=0), len(sweeps)
     if count == 1:

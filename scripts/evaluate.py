@@ -77,7 +77,8 @@ def main() -> None:
         result = {"task": run.task, "run": portable_path(run.folder), "checkpoint": run.checkpoint.name}
         result |= {"steps": runner.logger.tot_timesteps, "perturbation": args.perturbation or kept}
         result |= {"ranges": args.ranges or kept, "motors": args.motors or kept, "set": args.set}
-        result |= {"command": args.command, "num_envs": env.num_envs, "seed": args.seed}
+        command = args.command or (grounds and [*grounds.command, 0.0])
+        result |= {"command": command, "num_envs": env.num_envs, "seed": args.seed}
         result |= {"device": device, "versions": package_versions()}
         result |= {name: rate for name in cli.CLOCKS if (rate := getattr(args, name))}
         write_json(args.json, without_machine(result | measured))

@@ -33,6 +33,7 @@ from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS, hide_nan
 from legged_torque.utils.options import DEFAULT_TASK
 from legged_torque.utils.task_registry import LOGS, LoadedRun, experiment_dir, set_seed
+from legged_torque.viewer.training_viewer import HOST, PORT
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -89,7 +90,7 @@ def parse_args() -> argparse.Namespace:
     parser = cli.Parser(__doc__)
     cli.add_task_args(parser)
     parser.set_defaults(seed=1)
-    hint = f"control steps, 50 of them a second; default: {STEPS}"
+    hint = f"control steps, of most tasks 50 a second; default: {STEPS}"
     parser.add_argument("--steps", type=int, help=hint)
     hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
     parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
@@ -106,13 +107,14 @@ def parse_args() -> argparse.Namespace:
     parser.add_argument("--viewer", choices=NUM_ENVS, default="none", help=hint)
     hint = "run whose policy walks next to the followed robot, under the same command (--viewer web): a name or a path"
     parser.add_argument("--compare", metavar="RUN", help=hint)
-    hint = "address of the page; default: %(default)s, this machine alone; others need the printed token"
-    parser.add_argument("--host", default="127.0.0.1", help=hint)
-    parser.add_argument("--port", type=int, default=8080, help="port of the page, or the next free one; default: 8080")
+    hint = f"address of the page; default: {HOST}, this machine alone; others need the printed token"
+    parser.add_argument("--host", help=hint)
+    parser.add_argument("--port", type=int, help=f"port of the page, or the next free one; default: {PORT}")
     args = parser.parse_args()
     cli.check_args(args, steps=Count, command=list[float], port=Annotated[int, Limits(1, 65535)])
     check_combinations(args)
     args.grid, args.steps = args.grid or 1, args.steps or STEPS
+    args.host, args.port = args.host or HOST, args.port or PORT
     if args.num_envs is None:
         args.num_envs = 1 if args.compare else max(NUM_ENVS[args.viewer], args.grid)
     if args.video:
@@ -133,8 +135,9 @@ def check_combinations(args: argparse.Namespace) -> None:
         raise UserError(f"--agent {args.agent} has no run: {others} are for policies")
     if args.headless and args.viewer == "native":
         raise UserError("--headless opens no window, but --viewer native is one; --viewer web is a page")
-    if args.compare and args.viewer != "web":
-        raise UserError("--compare needs --viewer web")
+    for option in ("compare", "host", "port"):
+        if getattr(args, option) and args.viewer != "web":
+            raise UserError(f"--{option} needs --viewer web")
     if args.no_video and (args.video or (args.grid or 1) > 1 or has_viewer):
         raise UserError("--no_video prints metrics alone: leave out --video, --grid and --viewer")
     if args.level and not args.terrain:

@@ -21,7 +21,7 @@ from legged_torque.utils.devices import choose_offscreen_renderer
 from legged_torque.utils.errors import UserError, printable
 from legged_torque.utils.files import part_of, portable_path, without_machine, write_errors, write_whole
 from legged_torque.utils.plain_yaml import dump_yaml
-from legged_torque.utils.policies import CARD, read_card, sha256, upload
+from legged_torque.utils.policies import CARD, check_upload, read_card, sha256, upload
 from legged_torque.utils.runs import CONFIG_FILE, load_config
 
 ROBOTS, STEPS, SHOWN_STEPS = 16, 500, 250
@@ -58,6 +58,8 @@ def main() -> None:
     if args.out.exists():
         raise UserError(f"'{args.out}' exists: --out must be a new folder")
     cli.check_output(args.out / CARD)
+    if args.push:
+        check_upload(args.push)
     no_renderer = choose_offscreen_renderer()
     with cli.slow_imports():
         from legged_torque.deploy.policy import Policy
@@ -89,10 +91,13 @@ def main() -> None:
             numbers = {name: [round(value.mean, 5), round(value.standard_error, 5)] for name, value in metrics.items()}
             card.setdefault("metrics", {"plain MuJoCo": numbers})
             write_cards(part, card)
+            try:
+                recorder.write(part / VIDEO, no_renderer)
+            except UserError as error:
+                print(f"no video: {error}")
             part.rename(args.out)
         finally:
             shutil.rmtree(part, ignore_errors=True)
-    recorder.save(args.out / VIDEO, no_renderer)
     print(f"Look at it: python -m http.server -d {shlex.quote(str(args.out))}")
     if args.push:
         print(f"Uploaded to {upload(args.out, args.push)}")

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import importlib
 import re
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -70,9 +71,16 @@ def download_run(path: str, checkpoint: int | None) -> Path:
     return run
 
 
+def check_upload(repository: str) -> None:
+    """Raise a UserError if the Hub's client is not installed, or takes no such name of a model."""
+    with _client("huggingface_hub", "hub", f"cannot upload to '{repository}'"):
+        importlib.import_module("huggingface_hub.utils").validate_repo_id(repository)
+
+
 def upload(folder: Path, repository: str) -> str:
     """Upload a folder to a model of the Hub, and return the address of the commit; a UserError if that fails."""
-    with _client("huggingface_hub", "hub", f"cannot upload '{folder}' to '{repository}'") as client:
+    again = f"'{shlex.join(['hf', 'upload', repository, str(folder)])}' tries again"
+    with _client("huggingface_hub", "hub", f"cannot upload '{folder}' to '{repository}' ({again})") as client:
         hub = client.HfApi()
         hub.create_repo(repository, exist_ok=True)
         return str(hub.upload_folder(repo_id=repository, folder_path=folder).commit_url)

@@ -102,8 +102,7 @@ class Plots:
         histories = [past, *([list(other.history)] if other else [])]
         for name in past[0].metrics:
             sums = [sum((one.metrics.get(name, np.zeros(2)) for one in past), np.zeros(2)) for past in histories]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                texts = [f"{above / below:.3g}" for above, below in sums]
+            texts = [f"{above / below:.3g}" if below else "-" for above, below in sums]
             rows.append((f"{name.replace('_', ' ')} {UNITS[name] and f'[{UNITS[name]}]'}", "", texts))
         head = f"<b>Metrics, last {HISTORY_STEPS * self._session.task.dt:g} s</b>"
         return table_html((head, "", ["actual", "companion"][: len(histories)]), *rows)

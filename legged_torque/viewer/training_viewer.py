@@ -17,7 +17,7 @@ from legged_torque.utils.runs import checkpoint_number
 
 EXTRAS = {"viewer": ("viser", "trimesh"), "video": ("imageio", "imageio_ffmpeg", "PIL")}
 HOST, PORT = "127.0.0.1", 8080  # of the page, or the next free port
-VIDEO_STEPS = 250  # control steps of a video: 5 s
+VIDEO_STEPS = 250  # control steps of a video: 5 s of most tasks
 VIDEO_TIMEOUT = 300.0  # seconds that the end of a training waits for its last video
 END_TIMEOUT = 5.0  # seconds after which a process that should end is killed
 LOWEST_PRIORITY = 19

@@ -85,12 +85,14 @@ class VideoRecorder:
         except Exception as error:  # whatever the graphics driver raises
             raise UserError(f"the renderer does not start: {error} ({INSTALL_HINT})") from None
         cameras = [Camera(drawing.ground, drawing.size) for _ in range(side**2)]
-        shown = list(enumerate(self.steps, start=1))[::STRIDE]
+        is_gif = file.suffix.lower() == ".gif"  # whose frames of 10 ms or less browsers show for 100 ms
+        stride = max(STRIDE, math.ceil(0.02 / self._control_step - 1e-6)) if is_gif else STRIDE
+        shown = list(enumerate(self.steps, start=1))[::stride]
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / file.name
-            frame_step = STRIDE * self._control_step
+            frame_step = stride * self._control_step
             timing: dict[str, Any] = {"fps": 1.0 / frame_step, "macro_block_size": 1}
-            if file.suffix.lower() == ".gif":
+            if is_gif:
                 timing = {"duration": gif_durations(len(shown), frame_step)}
             writer = imageio.get_writer(part, **timing)
             with renderer, writer, Counter("rendering, frame", len(shown)) as counter:

@@ -21,8 +21,10 @@ def files(tmp_path):
         "one": sweep("go2_position", "motor_strength", "", tracking),
         "two": sweep("anymal_c_rough_torque_multihead", "motor_strength", "", tracking),
         "three": sweep("go2_position", "push_velocity", "m/s", fell),
+        "wider": sweep("go2_position", "motor_strength", "", tracking),
         "broken": sweep("go2_position", "motor_strength", "", {}),
     }
+    contents["wider"]["sweep"]["parts"][1]["to"] = 3.0
     for name, content in contents.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(content))
     return tmp_path
@@ -41,7 +43,7 @@ def test_figure(files):
 
 def test_mistakes(files):
     """A sweep without numbers is named, and so is a file that is none."""
-    told = {"broken": "a sweep of motor_strength for go2_position is not whole"}
+    told = {"broken": "a sweep of motor_strength for go2_position is not whole", "wider": "different ranges"}
     parts = [{"from": 0.0, "to": 1.0, "fell": 1}]
     whole = {"parameter": "x", "unit": "", "parts": parts}
     for number, (task, content) in enumerate([(5, whole), ("a", [1]), ("a", whole | {"parameter": []}), ("a", whole)]):

@@ -91,3 +91,5 @@ def test_crossing_tiles_after_training_on_a_plane(root, tmp_path):
         place = rf"{row['kind']} +{row['level']:g} +2 +0.000 \+- 0.000 +{row['fell']['mean']:.3f} "
         assert re.search(rf"(?m)^  {place}", output), row
     assert "8 worlds, commanded to walk 2 0 m/s for 4.0 s at most:" in output
+    _, result = evaluate(root, tmp_path / "c.json", "--terrain=flat", "--level=0", "--num_envs=1")
+    assert result["command"] == [0.6, 0.0, 0.0]

@@ -104,6 +104,7 @@ def test_cards_of_strangers(script, server, card):
         (["sim2sim.py", "hf:none"], "cannot download the policy 'hf:none': "),
         (["publish.py", "a1/positoin"], "a1/position"),
         (["publish.py", "a1/position", "--out=."], "'.' exists"),
+        (["publish.py", "a1/position", "--push=bad name"], "cannot upload to 'bad name': Repo id must"),
     ],
 )
 def test_mistakes(script, tmp_path, words, expected):

@@ -40,6 +40,9 @@ for robots, rate, ending in ((1, 75.0, "gif"), (4, 25.0, "mp4")):
     assert frames == [(1, 3), (2, 3), (3, 3)], frames
 recorder.steps = 2 * [[row[:1] for row in recorder.steps[0]]]
 recorder.write(Path(sys.argv[2]) / "2.gif", None)
+recorder = VideoRecorder(Drawing(model), 0.005)
+recorder.steps = 8 * [[np.tile(qpos, (1, 1)), np.ones((1, 3)), np.zeros((1, 3))]]
+recorder.write(Path(sys.argv[2]) / "fast.gif", None)
 """
 
 
@@ -71,6 +74,8 @@ def test_frames(tmp_path):
     assert durations == [30, 20, 30]  # [ms]: a gif counts hundredths of seconds
     with Image.open(file.with_name("2.gif")) as picture:
         assert (picture.n_frames, picture.size) == (1, (960, 540))
+    with Image.open(file.with_name("fast.gif")) as picture:  # browsers show frames of 10 ms too long
+        assert (picture.n_frames, picture.info["duration"]) == (2, 20)
 
 
 def test_recorded_worlds(make_task):
