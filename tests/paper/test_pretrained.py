@@ -2,14 +2,16 @@
 
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from support.gravity import CONFIGURATIONS, FEW, SMALL, STD, STEPS, TASK, words_of
 from support.scripts import assert_told_in_one_line, contents, run_here
-from support.settings import get_cfgs
+from support.settings import error_of, get_cfgs
 
+from legged_torque.envs import task_registry
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
-from legged_torque.paper.gravity.pretrained import check_making, check_spaces, read_pretrained
+from legged_torque.paper.gravity.pretrained import check_making, check_spaces, make_pretrained, read_pretrained
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +149,18 @@ def test_settings_that_make_no_sense(tmp_path):
     result = run_here("pretrain_gravity.py", "--device=cpu", "--task=a1_torque", root=tmp_path)
     assert_told_in_one_line(result, "task 'a1_torque' has no pre-training")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (torch.nn.Linear(1, 1), "pretraining.function must return a network and a dictionary"),
+        ((torch.nn.Linear(1, 1), {"loss": np.float64(0.5)}), "takes tensors and plain values only, not float64"),
+    ],
+)
+def test_functions_of_ones_own(monkeypatch, tmp_path, made, message):
+    """What they return is kept, unless it is something else, or could not be loaded again."""
+    monkeypatch.setattr(gravity_pretraining, "pretrain", lambda *_: made)
+    env_cfg, train_cfg = task_registry.get_cfgs(TASK)
+    assert message in error_of(make_pretrained, tmp_path / "new" / "a.pt", TASK, env_cfg, train_cfg, "cpu")
+    assert not list(tmp_path.rglob("*.pt"))

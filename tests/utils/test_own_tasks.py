@@ -152,11 +152,33 @@ task_registry.register("faulty", Alone, A1TorqueCfg(), A1TorqueCfgPPO())
 """
 
 
-def test_a_term_of_a_wrong_shape(tmp_path):
+TRAINING = """
+from legged_torque.envs import A1TorqueCfg, A1TorqueCfgPPO, task_registry
+from legged_torque.utils.config import Section
+
+class Cfg(A1TorqueCfgPPO):
+{}
+
+task_registry.register("faulty", "legged_torque.envs:TorqueRobot", A1TorqueCfg(), Cfg())
+"""
+RUNNER = TRAINING.format("    class runner:\n        class_name = 'OnPolicyRunner'")
+CURIOUS = TRAINING.format("    class algorithm:\n        class rnd_cfg(Section):\n            weight: float = 1.0")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (ALONE, "reward term 'torques' must be float32 (2,) on cpu, not float32 () on cpu"),
+        (RUNNER, "runner.class_name must name legged_torque.learning.runner:OnPolicyRunner or what inherits it, not"),
+        (CURIOUS, "does not support algorithm.rnd_cfg"),
+    ],
+    ids=["reward", "runner", "rnd_cfg"],
+)
+def test_what_cannot_train(text, message, tmp_path):
     """It is found before the run has a folder."""
-    (tmp_path / "faulty.py").write_text(ALONE)
+    (tmp_path / "faulty.py").write_text(text)
     told = run_here("train.py", "--task_file=faulty.py", "--task=faulty", *SMALL, root=tmp_path)
-    assert_told_in_one_line(told, "reward term 'torques' must be float32 (2,) on cpu, not float32 () on cpu")
+    assert_told_in_one_line(told, message)
     assert not (tmp_path / "logs").exists()
 
 
