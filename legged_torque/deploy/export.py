@@ -140,6 +140,8 @@ def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
     ours = (Motor.describe, ModelMotor.describe)
     inherited = {name: link for name, link in task.motors.links.items() if type(link).describe in ours}
     problems = [f"the motor '{name}' has no describe()" for name, link in inherited.items() if not link.describe()]
+    if not problems and not any(link.describe() for link in task.motors.links.values()):
+        problems.append("no link of motors.chain limits torques")
     if task.terrain.map and not isinstance(task.terrain, RoughGround):
         problems.append(f"the ground {type(task.terrain).__name__} is not described")
     return parts_without_function(description) + problems

@@ -187,6 +187,8 @@ def check_learner(alg: Any, env: Any, num_processes: int) -> None:
     name = type(alg).__name__
     if missing := [attribute for attribute in Learner.__annotations__ if not hasattr(alg, attribute)]:
         raise UserError(f"{name} lacks {', '.join(missing)}")
+    if not callable(alg.policy()):
+        raise UserError(f"{name}.policy must return what computes actions, not {alg.policy()}")
     if alg.needs_next_obs and not hasattr(env, "keep_final_observations"):
         raise UserError(f"{name} needs observations before resets, which {type(env).__name__} does not keep")
     if num_processes > 1 and not hasattr(alg, "broadcast_parameters"):

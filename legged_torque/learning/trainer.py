@@ -159,6 +159,8 @@ class Trainer:
         if hasattr(self.alg, "set_progress"):
             self.alg.set_progress(self.current_learning_iteration, num_iterations)
         numbers = self.alg.update() if self.alg.due() else {}
+        if not isinstance(numbers, dict):
+            raise UserError(f"{type(self.alg).__name__}.update must return a dictionary of numbers, not {numbers}")
         return {name: float(number) for name, number in numbers.items()}
 
     def _evaluate(self, numbers: dict[str, float], begin: float, ended: int) -> dict[str, float]:

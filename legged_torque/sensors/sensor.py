@@ -38,6 +38,8 @@ class Sensor(Buffers):
         self.delay = round(late)  # control steps
         if abs(late - self.delay) > 1e-6 * late:
             raise UserError(f"a sensor's delay must be whole control steps of {state.dt:g} s, not {cfg.delay:g} s")
+        if not isinstance(self.shape(), tuple):
+            raise UserError(f"{type(self).__name__}.shape must return a tuple, such as (3,), not {self.shape()}")
         self.has_noise = False  # whether errors are added; the task sets it
         self._kept = self.buffer("kept", self.delay + 1, *self.shape())  # the newest first
         self.newest, self.values = self._kept[:, 0], self._kept[:, -1]

@@ -129,6 +129,9 @@ def test_networks_that_were_not_equivariant(make_task, tmp_path):
     runner.learn(1)
     with pytest.raises(UserError, match=r"not equivariant: they need --set algorithm\.symmetry_cfg\.use_equivariant"):
         build_runner(make_task, "a1_torque", **SMALL).load(f"{runner.log_dir}/model_1.pt")
+    few = build_runner(make_task, "a1_torque", **{**SMALL, **without, "algorithm.num_mini_batches": 10**6})
+    few.load(f"{runner.log_dir}/model_1.pt")  # to play, for which there are samples enough
+    assert "more than the samples" in error_of(few.learn, 1)
     player = build_runner(make_task, "a1_torque", **SMALL)
     player.load(f"{runner.log_dir}/model_1.pt", {"actor": True})
     assert "not equivariant" in error_of(player.learn, 1)

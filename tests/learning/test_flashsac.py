@@ -15,6 +15,7 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from legged_torque.envs import task_registry
+from legged_torque.envs.tasks import A1TorqueCfgPPO
 from legged_torque.learning.flashsac import FlashSAC
 from legged_torque.learning.flashsac.exploration import RepeatedNoise
 from legged_torque.learning.flashsac.networks import Trunk, UnitBatchNorm, UnitLinear, bound_weights, squashed
@@ -213,13 +214,24 @@ def test_mistakes(tmp_path, change, told):
     assert not [*tmp_path.rglob("config.yaml")]
 
 
-def test_settings_of_other_learners_are_refused():
+class DecayingCfgPPO(A1TorqueCfgPPO):
+    """PPO with an optimizer that would shrink an actor that does not learn yet."""
+
+    class algorithm(A1TorqueCfgPPO.algorithm):
+        optimizer: str = "adamw"
+
+
+def test_settings_of_other_learners_are_refused(make_task):
     """PPO would not read those of FlashSAC; only PPO has a critic that can learn first."""
     assert "flashsac.n_steps is not read" in error_of(get_cfgs, "--set=flashsac.n_steps=1")
     warmup = "pretraining.critic_warmup_iterations"
     assert get_cfgs(f"--set={warmup}=5")[1].pretraining.critic_warmup_iterations == 5
     for preset in ("flashsac", "student"):
         assert error_of(get_cfgs, f"--preset={preset}", f"--set={warmup}=5").startswith(f"{warmup} is not read by ")
+    cfg = DecayingCfgPPO()
+    cfg.pretraining.critic_warmup_iterations = 5
+    refused = error_of(task_registry.make_alg_runner, make_task("a1_torque", 4), train_cfg=cfg, log_root=None)
+    assert refused.startswith(f"{warmup} needs ")
 
 
 @pytest.mark.parametrize("copies", [(), (2,)])

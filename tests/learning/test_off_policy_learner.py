@@ -149,6 +149,10 @@ def test_what_does_not_fit_is_refused(make_task):
     assert message == "algorithm.class_name: Idle is no learner, it lacks construct_algorithm"
     message = error_of(build_runner, make_task, "a1_torque", **{"algorithm.class_name": "PPO"})  # rsl_rl's own
     assert message.endswith(": PPO is no learner, it lacks observe, due, policy, state_dict, load_state_dict")
+    blind = type("Blind", (TDLearner,), {"policy": lambda learner: None})
+    assert error_of(make_trainer, blind) == "Blind.policy must return what computes actions, not None"
+    mute = make_trainer(type("Mute", (TDLearner,), {"update": lambda learner: None}))
+    assert error_of(mute.learn, 2) == "Mute.update must return a dictionary of numbers, not None"
     forgetful = type("Forgetful", (PointMasses,), {"keep_final_observations": property()})
     message = error_of(make_trainer, TDLearner, task=forgetful())
     assert message == "TDLearner needs observations before resets, which Forgetful does not keep"

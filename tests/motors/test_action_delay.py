@@ -7,6 +7,8 @@ import torch
 from support.control import CONVERGED, HIGH_UP, NOMINAL, TORQUE_LIMIT, pd_by_hand, time_out
 from support.settings import error_of, torques_in_torch
 
+from legged_torque.deploy.export import unknown_parts
+
 EXCEEDED = {1: 10.83, 3: 16.27, 5: 20.52, 15: 37.70, 35: 66.62}
 """The 99.9% quantile of chi-square, by degrees of freedom."""
 
@@ -177,6 +179,14 @@ def test_a_delay_outside_the_chain(make_task):
     settings = {"motors.chain": ["ideal"], **delayed(0, 3, "physics_steps")}
     assert make_task("a1_torque", 1, **settings).notes == ["motors.delay has no effect: motors.chain lacks 'delay'"]
     assert make_task("a1_torque", 1, **{**settings, "motors.chain": ["delay", "ideal"]}).notes == []
+    limitless = make_task("a1_torque", 1, **{"motors.chain": ["delay"]})
+    assert unknown_parts(limitless, {"actions": {"terms": []}}) == ["no link of motors.chain limits torques"]
+
+
+def test_a_height_scan_of_a_plane(make_task):
+    """A note tells that the policy does not see it."""
+    task = make_task("a1_torque", 1, **{"terrain.measure_heights": True})
+    assert task.notes == ["terrain.measure_heights has no effect: terrain.mesh_type is plane"]
 
 
 def test_torques_that_cannot_follow(make_task):

@@ -198,6 +198,12 @@ def test_other_shapes(shape, delay):
     assert f"must be float32 (2, 3) on cpu, not float32 {tuple(shape)} on cpu" in error_of(RayRobot, cfg)
 
 
+def test_a_shape_that_is_a_number(monkeypatch):
+    """It is refused by name."""
+    monkeypatch.setattr(DownwardRay, "shape", lambda sensor: 3)
+    assert error_of(RayRobot, RayCfg()) == "DownwardRay.shape must return a tuple, such as (3,), not 3"
+
+
 def test_the_name_of_the_height_scan():
     """On rough ground, where it is taken, no other sensor can have it."""
     cfg = task_registry.get_cfgs("a1_rough_torque")[0]

@@ -46,8 +46,10 @@ def delays(cfg: Any) -> dict[str, LatencyCfg]:
     return links | {"sensing.delay": cfg.sensing.delay}
 
 
-def idle_links(cfg: Any) -> Iterator[str]:
-    """Yield a note for each section of motors that is set, but is no link of their chain."""
+def idle_settings(cfg: Any) -> Iterator[str]:
+    """Yield a note for a height scan of a plane, and each section of motors that is set, but is no link of a chain."""
+    if cfg.terrain.measure_heights and cfg.terrain.mesh_type == "plane":
+        yield "terrain.measure_heights has no effect: terrain.mesh_type is plane"
     for name, link in vars(cfg.motors).items():
         kind = DelayCfg if isinstance(link, DelayCfg) else type(link)
         is_set = isinstance(link, MotorCfg) and to_dict(link) != to_dict(kind())

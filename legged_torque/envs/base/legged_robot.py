@@ -10,7 +10,7 @@ from torch import Tensor
 from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParameters, position_residual
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
-from legged_torque.envs.base.clocks import idle_links
+from legged_torque.envs.base.clocks import idle_settings
 from legged_torque.envs.base.commands import make_commands
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.hooks import check_methods
@@ -312,7 +312,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         self.symmetry = self.asset.symmetry(cfg.asset.mirrored_legs)
-        self.notes = [*self.asset.notes, *self.sim.notes, *idle_links(cfg)]
+        self.notes = [*self.asset.notes, *self.sim.notes, *idle_settings(cfg)]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""

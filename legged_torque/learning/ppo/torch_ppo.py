@@ -118,6 +118,8 @@ class TorchPPO(PPO):
         alg = PPO.construct_algorithm(obs, env, {**cfg, "algorithm": algorithm}, device)
         alg.update_graph.enabled = cfg["capture"]
         alg.warm_up_iterations = cfg["pretraining"]["critic_warmup_iterations"]
+        if alg.warm_up_iterations and alg.optimizer.defaults["weight_decay"]:
+            raise UserError("pretraining.critic_warmup_iterations needs the optimizer adam: adamw shrinks the actor")
         alg._control_law = getattr(env, "control_law", None)
         return alg
 
@@ -133,15 +135,19 @@ class TorchPPO(PPO):
 
         A policy that only plays needs neither.
         """
-        if not self._is_symmetric:
-            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
-            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
+        self._check_symmetry()
         worlds, steps = self.storage.num_envs, self.storage.num_transitions_per_env
         if worlds * steps < self.num_mini_batches:
             raise UserError(
                 f"algorithm.num_mini_batches is {self.num_mini_batches}, more than the samples of a rollout "
                 f"({worlds} worlds x {steps} steps)"
             )
+
+    def _check_symmetry(self) -> None:
+        """Raise a UserError if networks were loaded that are not equivariant, but should be."""
+        if not self._is_symmetric:
+            setting = "algorithm.symmetry_cfg.use_equivariant_networks=false"
+            raise UserError(f"the checkpoint's networks are not equivariant: they need --set {setting}")
 
     def observe(self, transition: Transition) -> None:
         """Keep what followed the actions, and compute returns after the last step of a rollout."""
@@ -241,7 +247,7 @@ class TorchPPO(PPO):
         weights = parameters_to_vector(self._parameters)
         self._is_symmetric = not self.mirrored or self.mirrored.is_symmetric(weights)
         if load_cfg is None:
-            self.allocate()
+            self._check_symmetry()
         self.learning_rate = learning_rate.copy_(torch.as_tensor(self.learning_rate))
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate
