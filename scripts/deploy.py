@@ -96,6 +96,7 @@ def main() -> None:
     operators[0].begin_with(args.command or [0.0, 0.0, 0.0])
     devices = [(Datagrams, args.udp), (Gamepad, args.gamepad)]
     operators += [kind(controller, address) for kind, address in devices if address]
+    is_alone = args.walk and len(operators) == 2 and not sys.stdin.isatty()  # nobody can have it stand up again
     log = None
     if args.log:
         from legged_torque.runtime.log import Log
@@ -122,6 +123,8 @@ def main() -> None:
             for operator in operators:
                 operator.look()
             if any(each.has_ended for each in (*operators, *([policy] if args.chirp else []))):
+                break
+            if is_alone and session.stops:
                 break
             time.sleep(POLL)
     for each in repeated:

@@ -25,9 +25,9 @@ from legged_torque.utils.errors import UserError, counted
 from legged_torque.utils.files import portable_path, without_machine, write_json
 from legged_torque.utils.limits import Count
 from legged_torque.utils.metrics import UNITS, hide_nan
-from legged_torque.utils.options import PUSH, draw_only
+from legged_torque.utils.options import PUSH, draw_only, without_effect
 from legged_torque.utils.runs import package_versions
-from legged_torque.utils.task_registry import LoadedRun, set_seed
+from legged_torque.utils.task_registry import LoadedRun, print_notes, set_seed
 
 if TYPE_CHECKING:
     from rsl_rl.runners import OnPolicyRunner
@@ -65,6 +65,7 @@ def main() -> None:
             draw_only(env_cfg, args.sweep)
     set_seed(args.seed)
     env, runner = task_registry.make_loaded(run, options, env_cfg)
+    print_notes(without_effect(env_cfg, options.set if args.sweep != PUSH else []))  # it pushes without the switch
     torch.manual_seed(args.seed)  # building and loading have drawn numbers too
     if args.sweep:
         measured = sweep(args, run, env, runner)

@@ -118,6 +118,8 @@ def with_faults(faults: object, words: list[str], joints: list[str]) -> object:
             number = check_value(f"--fault {name}", float(value), NotNegative if name in ("delay", "push") else Share)
         except ValueError:
             raise UserError(f"--fault {name} takes a number, not '{value}'") from None
+        if isinstance(getattr(faults, name), bool) and number not in (0.0, 1.0):
+            raise UserError(f"--fault {name} takes 0 or 1, not {value}")
         setattr(faults, name, type(getattr(faults, name))(number))
     return faults
 

@@ -30,7 +30,7 @@ from legged_torque.utils.config import Section, flat, section_keys, to_dict
 from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
-from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options
+from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options, without_effect
 from legged_torque.utils.runs import CONFIG_FILE, given_iterations, new_run_dir, package_versions
 from legged_torque.utils.stopwatch import stopwatch
 from legged_torque.utils.task_registry import experiment_dir, find_teachers, num_iterations, print_notes, set_seed
@@ -178,7 +178,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     env, _ = task_registry.make_env(options.task, options, env_cfg)
     stopwatch.lap("task")
     if is_first and isinstance(env, LeggedRobot) and not options.resume:
-        print_notes([standing_note(env), draws_note(env_cfg)])
+        print_notes([standing_note(env), draws_note(env_cfg), *without_effect(env_cfg, options.set)])
     runner, _ = task_registry.make_alg_runner(env, options.task, options, train_cfg)
     if not isinstance(runner, Trainer):
         ours = "legged_torque.learning.runner:OnPolicyRunner"

@@ -1,7 +1,9 @@
 """Fixtures of all tests: tasks on the CPU, small and seeded."""
 
 import contextlib
+import functools
 import gc
+import importlib.metadata
 import os
 import sys
 import tempfile
@@ -14,6 +16,7 @@ if sys.dont_write_bytecode:  # the processes that tests start, many, would all c
     os.environ["PYTHONPYCACHEPREFIX"] = os.path.join(tempfile.gettempdir(), "legged_torque_pycache")
 
 gc.set_threshold(50_000, 20, 100)  # a million objects of imports: looking through them took a tenth of the time
+importlib.metadata.version = functools.cache(importlib.metadata.version)  # MuJoCo Warp asks at each simulation, slowly
 
 import pytest
 import torch

@@ -142,7 +142,7 @@ def unknown_parts(task: LeggedRobot, description: dict[str, Any]) -> list[str]:
     problems = [f"the motor '{name}' has no describe()" for name, link in inherited.items() if not link.describe()]
     if not problems and not any(link.describe() for link in task.motors.links.values()):
         problems.append("no link of motors.chain limits torques")
-    if task.terrain.map and not isinstance(task.terrain, RoughGround):
+    if task.terrain.map and type(task.terrain) is not RoughGround:
         problems.append(f"the ground {type(task.terrain).__name__} is not described")
     return parts_without_function(description) + problems
 
@@ -273,7 +273,7 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
     others += ["commands.build"] if type(task.command_generator) is not UniformCommands else []
     if others := others + [f"terminations.{name}" for name in task.terminations if name != "contact"]:
         description["episode"]["not_simulated"] = others  # in sim2sim.py
-    if cfg.terrain.mesh_type == "heightfield":
+    if type(task.terrain) is RoughGround:
         description["terrain"] = dataclasses.asdict(Layout.of(cfg.terrain))
     return description
 

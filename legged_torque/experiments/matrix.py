@@ -14,9 +14,9 @@ from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
 from legged_torque.utils.config import flat, to_dict
-from legged_torque.utils.errors import UserError, check_names
+from legged_torque.utils.errors import UserError, check_names, refuse
 from legged_torque.utils.limits import Count, Worlds, check_value, types_of
-from legged_torque.utils.options import Options, draw_only, refuse_of_trainings
+from legged_torque.utils.options import Options, draw_only, refuse_of_trainings, without_effect
 from legged_torque.utils.plain_yaml import parse_yaml
 from legged_torque.utils.runs import (
     checkpoint_number,
@@ -179,13 +179,15 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
             check_student(learner.teachers, train_cfg.runner.num_steps_per_env, learner.gradient_length)
         check_names("perturbation", cell.evaluated_in, env_cfg.perturbations())
         for evaluation, settings in matrix.changed().items() if cell.task not in of_tasks else ():
-            options.set = [*words, *set_words(settings)]
+            options.set, options.perturbation = [*words, *set_words(settings)], "none"  # as step_words has it
             changed = task_registry.get_new_cfgs(options)[0]
             refuse_of_trainings(flat(settings), evaluation, changed)
             changed.commands.curriculum = False  # as evaluations have it
             check_env_cfg(changed)
             if evaluation.startswith(SWEEP):
                 draw_only(changed, evaluation.removeprefix(SWEEP))
+            else:
+                refuse([*without_effect(changed, set_words(settings))], evaluation)
             if to_dict(changed.asset) != to_dict(env_cfg.asset):
                 load_asset(changed)
         of_tasks[cell.task] = env_cfg

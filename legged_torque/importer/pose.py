@@ -88,7 +88,8 @@ def _standing(source: Source, legs: list[Leg], data: mujoco.MjData) -> tuple[flo
     model, jac = source.model, np.zeros((3, source.model.nv))
     mujoco.mj_comVel(model, data)
     mujoco.mj_rne(model, data, 0, data.qfrc_bias)
-    holding = data.qfrc_bias.copy()
+    mujoco.mj_passive(model, data)
+    holding = data.qfrc_bias - data.qfrc_spring
     lows = [lowest_point(data, leg.bodies[-1], leg.foot) for leg in legs]
     for leg, low in zip(legs, lows, strict=True):
         mujoco.mj_jac(model, data, jac, None, low, leg.bodies[-1])

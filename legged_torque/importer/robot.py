@@ -1,5 +1,6 @@
 """An imported robot: all that its MJCF and its settings need, and notes on what was changed."""
 
+import keyword
 import re
 from dataclasses import dataclass
 from itertools import chain, count
@@ -73,8 +74,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     those of the file. A UserError says why the file cannot be imported.
     """
     name = name or re.sub(r"\W", "_", file.stem).lower()
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise UserError(f"--name must be of small letters, digits and _, and begin with a letter, not '{name}'")
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+        rule = "of small letters, digits and _, begin with a letter and be no keyword of Python"
+        raise UserError(f"--name must be {rule}, not '{name}'")
     source = read_source(file)
     shapes = find_shapes(source)
     legs = find_legs(source, shapes)

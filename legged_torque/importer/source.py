@@ -80,6 +80,8 @@ def read_source(file: Path) -> Source:
             root = ET.parse(file).getroot()
             if any("xacro" in part.tag for part in root.iter()):  # MuJoCo would read the rest and nothing else
                 raise UserError(f"{what}: it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
+            for part in root.iter():
+                part.tag = part.tag.rpartition("}")[2]  # which MuJoCo reads without a namespace
             _prepare_urdf(root, what)
             is_urdf = root.tag == "robot"
             text = ET.tostring(root, encoding="unicode")
@@ -99,11 +101,14 @@ def read_source(file: Path) -> Source:
     others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
     several = [model.body(b).name for b in range(1, model.nbody) if model.body_jntnum[b] > 1]
     fixed = [model.body(b).name for b in range(2, model.nbody) if not model.body_jntnum[b]]
+    elsewhere = np.flatnonzero(model.actuator_trntype != mujoco.mjtTrn.mjTRN_JOINT)
+    pushing = ", ".join(model.actuator(i).name or f"number {i + 1}" for i in elsewhere)
     rules = {
         "its trunk does not float": model.njnt < 2 or model.jnt_type[0] != free,
         f"only hinge joints can be imported, not {', '.join(others)}": others,
         f"a body may have one joint, {', '.join(several)} have more": several,
         f"a body without joints that something refers to cannot be imported: {', '.join(fixed)}": fixed,
+        f"actuators that do not act on a joint cannot be imported: {pushing}": pushing,
         f"its {model.neq} equalities (closed loops, mimicked joints) cannot be imported": model.neq,
         f"its {model.ntendon} tendons cannot be imported": model.ntendon,
         f"it weighs {model.body_mass.sum():g} kg, at most {HEAVIEST:g} make sense": model.body_mass.sum() > HEAVIEST,
@@ -255,7 +260,7 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
 
     A mesh is at its path in the file, or at an end of it below a parent folder.
     """
-    missing, lost, types, folder = {}, dict[str, None](), ", ".join(MESH_TYPES), file.absolute().parent
+    missing, lost, types, folder = {}, dict[str, mujoco.MjsBody](), ", ".join(MESH_TYPES), file.absolute().parent
     roots = [folder / spec.meshdir, folder, *list(folder.parents)[:PARENTS]]
     for mesh in [mesh for mesh in spec.meshes if mesh.file]:
         parts = Path(mesh.file.split("://")[-1]).parts
@@ -276,12 +281,14 @@ def _find_meshes(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:
                 f"'{missing[geom.meshname].file}', which is missing or of a type other than {types}"
             )
         if geom.contype or geom.conaffinity:
-            lost[geom.parent.name] = None
+            lost[geom.parent.name] = geom.parent
         spec.delete(geom)
     for mesh in missing.values():
         spec.delete(mesh)
-    notes = Notes()
-    notes.on(lost, f"collision meshes are missing or not {types}, so shapes follow from inertias")
+    notes, reason = Notes(), f"collision meshes are missing or not {types}"
+    others = [name for name, body in lost.items() if any(geom.contype or geom.conaffinity for geom in body.geoms)]
+    notes.on((name for name in lost if name not in others), f"{reason}, so shapes follow from inertias")
+    notes.on(others, f"{reason} and left out, other shapes remain")
     return notes
 
 
@@ -290,9 +297,6 @@ def _torque_limits(model: mujoco.MjModel, notes: Notes) -> np.ndarray:
 
     It is the sum of its motors', or the joint's own.
     """
-    for actuator in range(model.nu):
-        if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-            raise UserError(f"the actuator '{model.actuator(actuator).name}' does not act on a joint")
     is_off = (1 << model.actuator_group.astype(np.int64)) & model.opt.disableactuator != 0
     off = dict.fromkeys(model.joint(joint).name for joint in model.actuator_trnid[is_off, 0])
     notes.on(off, "actuators of groups that the file disables are left out")

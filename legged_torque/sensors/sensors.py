@@ -14,7 +14,7 @@ from legged_torque.sensors.height_scan import HeightScan
 from legged_torque.sensors.sensing import Sensing
 from legged_torque.sensors.sensor import Sensor
 from legged_torque.sim.randomization import RandomParameter
-from legged_torque.utils.errors import UserError
+from legged_torque.utils.errors import UserError, unknown_name
 
 
 class Sensors(dict[str, Sensor]):
@@ -31,7 +31,9 @@ class Sensors(dict[str, Sensor]):
 
         ``motors`` have the joint encoders.
         """
-        sections = {name: value for name, value in vars(cfg.sensors).items() if isinstance(value, SensorCfg)}
+        sections = vars(cfg.sensors)
+        if others := [f"sensors.{name}" for name, value in sections.items() if not isinstance(value, SensorCfg)]:
+            raise UserError(f"{', '.join(others)} must inherit SensorCfg, as all sections of sensors")
         super().__init__({name: section.build(state) for name, section in sections.items()})
         self.height_scan = HeightScan(cfg.terrain, state) if state.ground.map is not None else None
         if self.height_scan:
@@ -45,6 +47,10 @@ class Sensors(dict[str, Sensor]):
         self.sensing = sensing if sensing.queue.is_needed or motors.encoder else None
         self._is_late = bool(self.sensing) and sensing.queue.is_needed
         self.has_kernels = not all(sensor.compilable for sensor in self.values())
+
+    def __missing__(self, name: str) -> Sensor:
+        """Raise a UserError: there is no such sensor."""
+        raise unknown_name("sensor", name, self)
 
     def begin_step(self) -> list[Callable[[], None]]:
         """Begin a control step; return what to call after each physics step, if sensors measure then."""

@@ -1,7 +1,7 @@
 """The options that scripts share, as plain values, and the changes that they make to settings."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -143,7 +143,9 @@ def choose_motors(env_cfg: Any, name: str) -> str:
     if not isinstance(values, dict):
         raise UserError(f"'{name}' must hold the sections {' and '.join(OF_MOTORS)}")
     check_names(f"section of '{name}'", values, OF_MOTORS)
+    rand, fixed = env_cfg.domain_rand, list(env_cfg.domain_rand.keep_fixed)
     update_from_dict(env_cfg, values)
+    rand.keep_fixed = [*fixed, *(each for each in rand.keep_fixed if each not in fixed)]
     links, given = env_cfg.motors, values.get("motors", {})
     known = (name for name in (*links.chain, *given) if name in given)
     return next((name for name in known if hasattr(getattr(links, name), "counted")), "")
@@ -169,6 +171,23 @@ def simulated_latency(env_cfg: Any, motors: str, latency: float | None) -> float
 def apply_perturbation(env_cfg: Any, name: str) -> None:
     """Apply one of the named sets of random events that a task's settings offer; an unknown name is a UserError."""
     update_from_dict(env_cfg, _named("perturbation", name, env_cfg.perturbations()))
+
+
+def without_effect(env_cfg: Any, changes: Iterable[str]) -> Iterator[str]:
+    """Yield a line for those changes, as ``--set`` has them, of what a task never draws since it is switched off."""
+    if not hasattr(env_cfg, "domain_rand"):  # a task of another kind
+        return
+    rand, paths = env_cfg.domain_rand, [change.partition("=")[0] for change in changes]
+    switches = {
+        "domain_rand.randomize_parameters": [f"domain_rand.{name}" for name in env_cfg.random_parameters()],
+        "domain_rand.push_robots": [f"domain_rand.{name}" for name in vars(rand) if name.startswith("push_")],
+        "noise.add_noise": [f"noise.{name}" for name in vars(env_cfg.noise)],
+    }
+    for switch, names in switches.items():
+        idle = [path for path in paths if path != switch and ".".join(path.split(".")[:2]) in names]
+        section, _, name = switch.partition(".")
+        if idle and not getattr(getattr(env_cfg, section), name):
+            yield f"{', '.join(idle)} has no effect without {switch}=true"
 
 
 def draw_only(env_cfg: Any, name: str) -> None:

@@ -13,7 +13,7 @@ from legged_torque.envs.robots.a1 import A1Cfg
 from legged_torque.motors.config import by_joint
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.rough import TERRAINS
+from legged_torque.terrain.rough import TERRAINS, RoughGround
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.mirroring import SCALAR
 from legged_torque.viewer.drawing import Drawing
@@ -163,6 +163,13 @@ def test_a_ground_without_tiles(make_task, monkeypatch):
     task = make_task("a1_torque", 1, **{"terrain.mesh_type": "hills"})
     assert Drawing.of_task(task).ground is None
     assert unknown_parts(task, {"actions": {"terms": []}}) == ["the ground Hills is not described"]
+
+
+def test_a_ground_of_other_tiles(make_task, monkeypatch):
+    """Exports do not describe a kind of rough ground by the settings of ours."""
+    monkeypatch.setitem(TERRAINS, "heightfield", type("Rougher", (RoughGround,), {}))
+    task = make_task("a1_rough_position", 1)
+    assert unknown_parts(task, {"actions": {"terms": []}}) == ["the ground Rougher is not described"]
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from legged_torque.identification.fit import Problem
 from legged_torque.identification.recording import Recording
 from legged_torque.identification.worlds import FIELDS, PARAMETERS, HangingRobots
 from legged_torque.runtime.sim_robot import SimRobot
-from legged_torque.utils.options import Options
+from legged_torque.utils.options import Options, choose_motors
 
 
 def test_the_trunk_is_fixed(tmp_path):
@@ -123,10 +123,17 @@ def test_settings(found):
     assert cfg.domain_rand.joint_offset["add"][1] == pytest.approx(0.055, rel=0.05)
 
 
-def test_a_delay_below_zero():
-    """It is written as none, which ``--motors`` takes."""
+def test_a_file_of_motors(tmp_path):
+    """A delay below zero is written as none, and what the file fixes adds to what a task does."""
     script = runpy.run_path(str(ROOT / "scripts" / "identify.py"))
-    text = script["settings_text"](list(POSE), dict(zip(PARAMETERS, -np.ones((5, 3)), strict=True)), 0.005, FIELDS)
+    values = dict.fromkeys(PARAMETERS, np.ones(3)) | {"delay": -np.ones(3)}
+    text = script["settings_text"](list(POSE), values, 0.005, FIELDS)
+    (tmp_path / "found.yaml").write_text(text)
+    cfg, _ = task_registry.get_cfgs("a1_torque")
+    cfg.domain_rand.keep_fixed = ["gravity", "dof_damping"]
+    choose_motors(cfg, str(tmp_path / "found.yaml"))
+    fixed = ["gravity", "dof_damping", "dof_armature", "dof_frictionloss"]  # what the task has fixed stays so
+    assert cfg.domain_rand.keep_fixed == fixed
     assert yaml.safe_load(text)["motors"]["delay"] == {"unit": "milliseconds", "range": [0, 0]}
 
 

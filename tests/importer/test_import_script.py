@@ -68,6 +68,7 @@ def test_script(tmp_path, monkeypatch):
     monkeypatch.setattr(task_registry, "_tasks", before)
     assert sorted(path.name for path in (tmp_path / "new").glob("dog.*")) == ["dog.py", "dog.xml"]
     assert_told_in_one_line(run("--out", "new"), "exists")
+    assert_told_in_one_line(run("--name", "class"), "be no keyword of Python, not 'class'")
     assert_told_in_one_line(run("--name", "random"), "there is another module 'random'; see --name")
     (tmp_path / "own.xml").write_text(as_mjcf(""))
     own = run_here("import_robot.py", "own.xml", "--force", root=tmp_path)

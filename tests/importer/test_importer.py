@@ -265,3 +265,34 @@ def test_refusals(tmp_path, entry):
     file.write_text(text_of(entry))
     with pytest.raises(UserError, match=entry["reason"]):
         import_robot(file)
+
+
+def test_a_namespace(written):
+    """A URDF of the same elements in a namespace is the same robot."""
+    plain, model, _ = written(urdf(), "urdf")
+    spaced, other, _ = written(urdf().replace("<robot", '<robot xmlns="http://www.ros.org"'), "urdf")
+    assert spaced.source.notes == plain.source.notes
+    assert other.body_mass.tolist() == model.body_mass.tolist()
+
+
+def test_a_mesh_that_is_missing_beside_another_shape(written):
+    """The other shape stays alone, as a note says; alone, it would be replaced by one of the body's inertia."""
+    box = '<collision><geometry><box size="0.3 0.2 0.1"/></geometry></collision>'
+    robot, model, _ = written(urdf().replace("</inertial>", f"</inertial>{box}", 1), "urdf")
+    assert [note for note in robot.source.notes if "mesh" in note] == [
+        "collision meshes are missing or not .stl, .obj, .msh and left out, other shapes remain: base"
+    ]
+    (shape,) = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == 1]
+    assert model.geom_size[shape].tolist() == pytest.approx([0.15, 0.1, 0.05])
+
+
+def test_springs(written):
+    """Motors hold a robot against its springs, too, and only gains that count them keep it within 0.2 rad."""
+    sprung = as_mjcf("").replace('thigh" axis', 'thigh" stiffness="4" springref="1.5" axis')
+    (with_springs, model, _), (without, *_) = written(sprung, "xml"), written(as_mjcf(""), "xml")
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.qfrc_spring).max() > 0.1 and with_springs.stance.load != without.stance.load
+    held = hold_pose(data, *with_springs.gains(), model.actuator_ctrlrange.T, 3.0)
+    assert not held.fall and held.error < 0.2

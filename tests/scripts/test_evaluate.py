@@ -37,7 +37,8 @@ def test_a_seed_fixes_every_number(root, tmp_path):
     """Two evaluations with one seed give the same file; another seed, perturbation or checkpoint, other numbers."""
     often = "--set=domain_rand.push_probability=0.5"  # or low and high would rarely differ in so few steps
     words = ["--num_envs=3", "--steps=20", "--seed=3", often]
-    _, result = evaluate(root, tmp_path / "a.json", *words)
+    output, result = evaluate(root, tmp_path / "a.json", *words)
+    assert "Note: domain_rand.push_probability has no effect without domain_rand.push_robots=true\n" in output
     assert result["set"] == ["domain_rand.push_probability=0.5"]
     torch.rand(11)
     evaluate(root, tmp_path / "b.json", *words)

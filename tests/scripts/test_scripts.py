@@ -61,10 +61,18 @@ def test_notes_on_settings_without_effect(tmp_path):
     """Ranges that nothing is drawn from, and an evaluation that begins after the end."""
     chain = ["--set=motors.chain=[delay, ideal, lag]", "--set=control.refresh_torques=false"]  # no kernel of its own
     words = [*SMALL, *chain, "--set=motors.lag.draws={time_constant: {set: [0.001, 0.003]}}", "--logger=none"]
+    words += ["--set=domain_rand.gravity={set: [9.0, 9.5]}", "--set=noise.noise_scales.dof_vel=5"]
     told = ("Note: motors.lag.draws needs", "Note: evaluation.also measures nothing", "but there are 16 steps")
+    told += tuple(
+        f"Note: {path} has no effect without {switch}=true"
+        for path, switch in (
+            ("domain_rand.gravity", "domain_rand.randomize_parameters"),
+            ("noise.noise_scales.dof_vel", "noise.add_noise"),
+        )
+    )
     for more, is_told in (([], True), (["--perturbation=low", "--set=evaluation.also_from=16"], False)):
         status, output, _ = run_here("train.py", *words, "--set=evaluation.also=[high]", *more, root=tmp_path)
-        assert status == 0 and [note in output for note in told] == [is_told] * 3
+        assert status == 0 and [note in output for note in told] == [is_told] * 5
         assert len(list(tmp_path.glob("logs/*/*/evaluations_high.csv"))) == (not is_told)
 
 

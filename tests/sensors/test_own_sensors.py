@@ -198,6 +198,19 @@ def test_other_shapes(shape, delay):
     assert f"must be float32 (2, 3) on cpu, not float32 {tuple(shape)} on cpu" in error_of(RayRobot, cfg)
 
 
+def test_sections_that_are_no_sensors():
+    """They are refused by name, as are sensors that do not exist."""
+
+    class Cfg(A1TorqueCfg):
+        class sensors:
+            class forgotten:
+                rate = 25.0
+
+    message = error_of(TorqueRobot, Cfg())
+    assert message == "sensors.forgotten must inherit SensorCfg, as all sections of sensors"
+    assert error_of(lambda: make().sensors["gird"]).startswith("unknown sensor 'gird'; did you mean 'grid'?")
+
+
 def test_a_shape_that_is_a_number(monkeypatch):
     """It is refused by name."""
     monkeypatch.setattr(DownwardRay, "shape", lambda sensor: 3)

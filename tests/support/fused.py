@@ -86,19 +86,8 @@ def put(sim, states):
             getattr(sim, field).copy_(torch.tensor(values))
 
 
-SELF_SCRATCH = {
-    "place",
-    "found",
-    "residual",
-    "pushing",
-    "change",
-    "of_pair",
-    "dist",
-    "normal",
-    "jacobian",
-    "joints",
-    "matrix",
-}
+SELF_SCRATCH = {"place", "found", "residual", "pushing", "change"}
+SELF_SCRATCH |= {"of_pair", "dist", "normal", "jacobian", "joints", "matrix"}
 
 
 def spoil(sim):

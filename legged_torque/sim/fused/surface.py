@@ -1,5 +1,6 @@
 """The surface of a height map, two triangles per cell, and its contacts with a sphere."""
 
+import functools
 import math
 
 import numpy as np
@@ -66,7 +67,7 @@ def _greatest(heights: np.ndarray, side: int, around: int) -> np.ndarray:
         squares = -(-(len(heights) - 1) // side)
         padded = np.pad(heights, ((around, around + side), (0, 0)), "edge")
         ends = range(side + 2 * around + 1)
-        heights = np.maximum.reduce([padded[i : i + squares * side : side] for i in ends]).T
+        heights = functools.reduce(np.maximum, (padded[i : i + squares * side : side] for i in ends)).T
     return heights
 
 
