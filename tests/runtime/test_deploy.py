@@ -159,7 +159,10 @@ def test_a_stop_without_an_operator(exported_go2, tmp_path):
         process.send_signal(signal.SIGSTOP)
         time.sleep(0.5)  # longer than any deadline
         process.send_signal(signal.SIGCONT)
-        said, _ = process.communicate(timeout=60.0)
+        try:
+            said, _ = process.communicate(timeout=60.0)
+        finally:
+            process.kill()
     assert process.returncode == 1 and "\nstopped: " in said
 
 
