@@ -48,6 +48,12 @@ def main() -> None:
     cli.check_args(args, rounds=Count)
     if args.profile and len(args.num_envs or [None]) > 1:
         raise UserError("--profile writes one trace: give one number of worlds")
+    if args.profile and not args.profile.name.endswith((".json", ".json.gz")):
+        raise UserError(f"--profile needs a name that ends in .json or .json.gz, not '{args.profile}'")
+    if args.profile and args.json and args.profile.resolve() == args.json.resolve():
+        raise UserError(f"--json and --profile would both write '{args.json}'")
+    if args.num_envs and any(item.startswith("env.num_envs=") for item in args.set):
+        raise UserError("--num_envs and --set env.num_envs cannot be given together")
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
     sizes = []
     with cli.slow_imports():

@@ -20,17 +20,20 @@ from legged_torque.utils.files import without_machine, write_json
 def main() -> None:
     """Parse the command line, and make the policy or check it."""
     parser = cli.Parser(__doc__)
-    cli.add_options(parser, *cli.SETTINGS, "num_envs", "log_root")
+    own = ("perturbation", "ranges")  # robots stand in trials of their own
+    cli.add_options(parser, *(name for name in cli.SETTINGS if name not in own), "num_envs", "log_root")
     parser.set_defaults(task="a1_torque_gravity")
     parser.add_argument("--num_configurations", type=int, help="random initial states; default: as in the task")
     parser.add_argument("--num_steps", type=int, help="control steps to follow each state; default: as in the task")
     parser.add_argument("--json", type=Path, help="write the report with its histograms to this file as well")
-    hint = "count how often the controller and the policy made before stand up from random states; makes no policy"
+    hint = "count how often the controller, with its defaults, and the policy made before stand up; makes no policy"
     parser.add_argument("--check_standing", action="store_true", help=hint)
     args = parser.parse_args()
     for name in ("num_configurations", "num_steps", "json") if args.check_standing else ():
         if getattr(args, name) is not None:
             raise UserError(f"--{name} is for making a policy, which --check_standing does not do")
+    if args.check_standing and any(item.startswith("pretraining.controller.") for item in args.set):
+        raise UserError("pretraining.controller is for making a policy: --check_standing has the controller's defaults")
     for name in () if args.check_standing else ("num_configurations", "num_steps", "seed"):
         if getattr(args, name) is not None:
             args.set.append(f"pretraining.{name}={getattr(args, name)}")
@@ -53,7 +56,7 @@ def main() -> None:
     if args.json:
         write_json(args.json, without_machine(report))
     print(f"The policy is in {file}")
-    choosing = ("task_file", "task", "log_root", *cli.CLOCKS, "set")  # all of which choose the policy
+    choosing = ("task_file", "task", "log_root", *cli.CLOCKS, "motors", "set")  # all of which choose the policy
     words = cli.option_words(args, *choosing)
     print(f"Train from it: {cli.script_command('train')} {shlex.join(words)}")
 

@@ -187,7 +187,7 @@ def read_matrix(file: Path, task_files: Iterable[str] = ()) -> Matrix:
             if evaluation.startswith(SWEEP):
                 draw_only(changed, evaluation.removeprefix(SWEEP))
             else:
-                refuse([*without_effect(changed, flat(settings))], evaluation)
+                refuse([*without_effect(changed, settings)], evaluation)
             if to_dict(changed.asset) != to_dict(env_cfg.asset):
                 load_asset(changed)
         of_tasks[cell.task] = env_cfg

@@ -128,7 +128,8 @@ class Distillation(algorithms.Distillation):
         """Learn from the rollout, worlds in random order; return the loss "behavior", and what the guard wants to know.
 
         The loss is the mean over the rollout, in all processes, where actions count by the weights of their torques.
-        Each epoch starts from what the student remembered when the rollout began.
+        Each epoch starts from what the student remembered when the rollout began. It leaves out as many worlds, other
+        ones each time, as minibatches of the same size do not hold.
         """
         count, num_steps = len(self._worlds), self.storage.num_transitions_per_env
         windows = torch.arange(num_steps, device=self.device).unsqueeze(1).split(len(self._steps))

@@ -79,7 +79,8 @@ def thermal(xp: Any, motor: Any, wanted: Any, pos: Any, vel: Any) -> tuple[Any, 
     """Derating by the RMS torque, a measure of heat: ``mean_square`` follows torque^2 with ``time_constant`` [s].
 
     The limit is the robot's highest torque while the RMS is below ``derating_from`` times ``continuous_torque`` [N m],
-    and falls linearly to the continuous torque, which it reaches when the RMS does.
+    and falls linearly to the continuous torque, which it reaches when the RMS does. A continuous torque above the
+    highest one limits nothing: another link must.
     """
     rms, continuous = xp.sqrt(motor.mean_square), motor.continuous_torque
     share = xp.clip((continuous - rms) / xp.clip(continuous * (1.0 - motor.derating_from), SMALL, None), 0.0, 1.0)

@@ -8,7 +8,7 @@ import signal
 
 import pytest
 import torch
-from support.scripts import run_here
+from support.scripts import assert_told_in_one_line, run_here
 from support.settings import build_runner
 
 from legged_torque.benchmark import measure as benchmark
@@ -38,6 +38,20 @@ def runner(make_task, tmp_path):
     runner = build_runner(make_task, "a1_position", 2, log_root=tmp_path, **SETTINGS)
     runner.claim_log_dir({})
     return runner
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--profile=a.txt"], "--profile needs a name that ends in .json or .json.gz, not 'a.txt'"),
+        (["--profile=a.json", "--json=a.json"], "--json and --profile would both write 'a.json'"),
+        (["--num_envs=8", "--set=env.num_envs=4"], "--num_envs and --set env.num_envs cannot be given together"),
+    ],
+)
+def test_mistakes(tmp_path, words, message):
+    """They are refused before anything is measured, and nothing is written."""
+    assert_told_in_one_line(run_here("benchmark.py", *SMALL, *words, root=tmp_path), message)
+    assert not list(tmp_path.iterdir())
 
 
 def test_numbers_belong_together(measured):

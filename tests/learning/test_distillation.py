@@ -350,6 +350,9 @@ def test_refusals(teacher):
         "--set=algorithm.learning_rate=1e-4": "is not read by legged_torque.learning.distillation:Distillation",
         "--task=a1_torque": "is of task 'a1_position', not 'a1_torque'",
     }
+    forgetful = [*SMALL, "--preset=student", "--set=distillation.student.rnn_type=none"]
+    result = run_here("train.py", *forgetful, "--set=distillation.student.rnn_hidden_dim=7", root=root)
+    assert_told_in_one_line(result, "rnn_hidden_dim is not read: distillation.student.rnn_type is none")
     before = set(root.rglob("*"))
     for word, message in told.items():
         words = [*SMALL, *OF_STUDENT, f"--set=distillation.teachers=[logs/a1_position/{name}]", word]

@@ -46,6 +46,10 @@ def test_standing_refuses(made, tmp_path):
     assert_told_in_one_line(result, "its control.torque_scale is 8.0, here it is 5.0")
     result = run_here("pretrain_gravity.py", *CHECK, "--num_steps=5", root=made[0])
     assert_told_in_one_line(result, "--num_steps is for making a policy, which --check_standing does not do")
+    result = run_here("pretrain_gravity.py", *CHECK, "--set=pretraining.controller.joint_damping=5", root=made[0])
+    assert_told_in_one_line(result, "pretraining.controller is for making a policy")
+    result = run_here("pretrain_gravity.py", *CHECK, "--perturbation=high", root=made[0])
+    assert_told_in_one_line(result, "unknown option '--perturbation'")
 
 
 def plot(figure, file, folder, name="picture.png"):

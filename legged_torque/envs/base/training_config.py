@@ -93,6 +93,9 @@ class TrainingCfg(BaseConfig):
             if path.startswith(SECTIONS) and not path.startswith(read):
                 allowed = ", ".join(name.rstrip(".") for name in read)
                 raise UserError(f"{path} is not read by {learner}, which reads {allowed}")
+            is_of_memory = path in ("distillation.student.rnn_hidden_dim", "distillation.student.rnn_num_layers")
+            if is_of_memory and cfg.distillation.student.rnn_type == "none":
+                raise UserError(f"{path} is not read: distillation.student.rnn_type is none")
 
     def check_code_names(self, registered: Iterable[TrainingCfg]) -> None:
         """Refuse, by UserError, names of code that none of the ``registered`` settings or their presets have.
