@@ -55,6 +55,7 @@ def test_few_worlds():
     means = [runs.loc[task.strip("`"), 256].mean() for task in header[3:-1]]
     assert len(runs) == 36 and "after {:.1f}, {:.1f} and {:.1f} million".format(*means) in text
     assert f"at the latest {runs[256].max():.1f}. 512" in text and runs[256].notna().all()
+    assert runs[[512, 768, 1024]].isna().sum().sum() == 2 and "(two failures as 7.5 million)" in text
     longer = np.log(runs.fillna(7.5)).sub(np.log(runs[256]), axis=0)
     chance = stats.ttest_1samp(longer[512], 0.0).pvalue
     times = [np.exp(longer[worlds].mean()) for worlds in (512, 768, 1024)]
