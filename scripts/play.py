@@ -31,8 +31,8 @@ from legged_torque.utils.errors import UserError
 from legged_torque.utils.files import path_inside
 from legged_torque.utils.limits import Count, Limits
 from legged_torque.utils.metrics import UNITS, hide_nan
-from legged_torque.utils.options import DEFAULT_TASK
-from legged_torque.utils.task_registry import LOGS, LoadedRun, experiment_dir, set_seed
+from legged_torque.utils.options import DEFAULT_TASK, without_effect
+from legged_torque.utils.task_registry import LOGS, LoadedRun, experiment_dir, print_notes, set_seed
 from legged_torque.viewer.training_viewer import HOST, PORT
 
 if TYPE_CHECKING:
@@ -64,6 +64,7 @@ def main() -> None:
     env_cfg.terrain.curriculum = env_cfg.commands.curriculum = False  # all tiles, all commands
     if kinds:
         select_tiles(env_cfg.terrain, kinds, levels, 1)
+    print_notes(without_effect(env_cfg, options.set))
     set_seed(args.seed)
     if run and args.viewer != "none":
         show(args, run)

@@ -25,7 +25,7 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 219,
     "legged_torque/deploy": 1578,
-    "legged_torque/envs": 5465,
+    "legged_torque/envs": 5466,
     "legged_torque/experiments": 1130,
     "legged_torque/identification": 459,
     "legged_torque/importer": 1301,
@@ -37,13 +37,13 @@ LINES = {
     "legged_torque/terrain": 580,
     "legged_torque/utils": 3545,
     "legged_torque/viewer": 2513,
-    "scripts": 2090,
+    "scripts": 2091,
     "paper": 3238,
     "tools": 1484,
-    "tests": 27994,
+    "tests": 27988,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 33_485  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 33_487  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

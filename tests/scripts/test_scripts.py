@@ -200,8 +200,10 @@ def test_train_stop_resume_play(tmp_path):
     configs = [yaml.safe_load((run / "config.yaml").read_text()) for run in (first, second)]
     assert configs[0]["env"] == configs[1]["env"] and configs[0]["train"] == configs[1]["train"]
 
-    status, output, error = run_here("play.py", *task, "--num_envs=2", "--steps=10", root=tmp_path)
+    noise = "--set=noise.noise_scales.dof_vel=5"
+    status, output, error = run_here("play.py", *task, noise, "--num_envs=2", "--steps=10", root=tmp_path)
     assert status == 0 and "Traceback" not in error
+    assert "Note: noise.noise_scales.dof_vel has no effect without noise.add_noise=true\n" in output
     assert f"model_{count + 2}.pt, after {(count + 2) * 8:,} steps of training:" in output
     for name in ("track_xy", "track_angular", "cost_of_transport", "falls_per_minute"):
         assert math.isfinite(float(re.search(rf"^\s*{name}\s+(\S+)", output, re.MULTILINE).group(1)))

@@ -1,14 +1,9 @@
 """The clocks of a task, in Hz: how often its policy acts, and how often its physics and motors step."""
 
-from collections.abc import Iterator
 from typing import Any
 
-from legged_torque.motors.config import DelayCfg, LatencyCfg, MotorCfg
-from legged_torque.motors.model_config import EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg
-from legged_torque.utils.config import to_dict
+from legged_torque.motors.config import DelayCfg, LatencyCfg
 from legged_torque.utils.errors import UserError
-
-LIMITLESS = (DelayCfg, EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg)  # behind which torques may be any
 
 
 def set_clocks(cfg: Any, policy_hz: float | None, physics_hz: float | None) -> float:
@@ -47,19 +42,6 @@ def delays(cfg: Any) -> dict[str, LatencyCfg]:
     """Return settings of delays by path: of all links of motors, in the chain or not, and of sensing."""
     links = {f"motors.{name}": link for name, link in vars(cfg.motors).items() if isinstance(link, DelayCfg)}
     return links | {"sensing.delay": cfg.sensing.delay}
-
-
-def idle_settings(cfg: Any) -> Iterator[str]:
-    """Yield a note for a height scan of a plane, and each section of motors that is set, but is no link of a chain."""
-    if cfg.terrain.measure_heights and cfg.terrain.mesh_type == "plane":
-        yield "terrain.measure_heights has no effect: terrain.mesh_type is plane"
-    if all(isinstance(getattr(cfg.motors, name, None), LIMITLESS) for name in cfg.motors.chain):
-        yield "no link of motors.chain limits torques: rewards and metrics count more than the joints get"
-    for name, link in vars(cfg.motors).items():
-        kind = DelayCfg if isinstance(link, DelayCfg) else type(link)
-        is_set = isinstance(link, MotorCfg) and to_dict(link) != to_dict(kind())
-        if is_set and name not in cfg.motors.chain:
-            yield f"motors.{name} has no effect: motors.chain lacks '{name}'"
 
 
 def whole_steps(path: str, steps: float) -> int:

@@ -10,7 +10,6 @@ from torch import Tensor
 from legged_torque.envs.base.actions import ActionTerm, ControlLaw, ControlParameters, position_residual
 from legged_torque.envs.base.asset import load_asset, nominal_pose
 from legged_torque.envs.base.base_task import BaseTask
-from legged_torque.envs.base.clocks import idle_settings
 from legged_torque.envs.base.commands import make_commands
 from legged_torque.envs.base.health import watched
 from legged_torque.envs.base.hooks import check_methods
@@ -34,7 +33,7 @@ from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.envs.base.symmetry import Mirror
 from legged_torque.envs.base.task_log import TaskLog
 from legged_torque.envs.base.terminations import Terminations
-from legged_torque.envs.base.validation import check_env_cfg
+from legged_torque.envs.base.validation import check_env_cfg, notes_on
 from legged_torque.motors.chain import MotorChain
 from legged_torque.motors.motor import Joints
 from legged_torque.sensors.sensors import Sensors
@@ -312,7 +311,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.dof_names, self.foot_names = self.asset.dof_names, self.asset.foot_names
         self.num_dof = len(self.dof_names)
         self.symmetry = self.asset.symmetry(cfg.asset.mirrored_legs)
-        self.notes = [*self.asset.notes, *self.sim.notes, *idle_settings(cfg)]
+        self.notes = [*self.asset.notes, *self.sim.notes, *notes_on(cfg)]
 
     def _init_buffers(self) -> None:
         """Allocate constants of the controller and of the rewards; approaches add their own."""

@@ -1,9 +1,16 @@
-"""Validate the settings of a task before anything is built."""
+"""Validate the settings of a task before anything is built, and note those that have no effect."""
+
+from collections.abc import Iterator
 
 from legged_torque.envs.base.clocks import delays
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
+from legged_torque.motors.config import DelayCfg, MotorCfg
+from legged_torque.motors.model_config import EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg
 from legged_torque.terrain.layout import Layout
+from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError, check_names
+
+LIMITLESS = (DelayCfg, EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg)  # behind which torques may be any
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
@@ -58,3 +65,16 @@ def _check_map(cfg: LeggedRobotCfg) -> None:
         if farthest > settings.border_size:
             most = f"at most terrain.border_size, {settings.border_size}, either way"
             raise UserError(f"terrain.{name} must be {most}, not {farthest}")
+
+
+def notes_on(cfg: LeggedRobotCfg) -> Iterator[str]:
+    """Yield notes: a height scan of a plane, a chain of motors without limits, and settings of motors outside it."""
+    if cfg.terrain.measure_heights and cfg.terrain.mesh_type == "plane":
+        yield "terrain.measure_heights has no effect: terrain.mesh_type is plane"
+    if all(isinstance(getattr(cfg.motors, name, None), LIMITLESS) for name in cfg.motors.chain):
+        yield "no link of motors.chain limits torques: rewards and metrics count more than the joints get"
+    for name, link in vars(cfg.motors).items():
+        kind = DelayCfg if isinstance(link, DelayCfg) else type(link)
+        is_set = isinstance(link, MotorCfg) and to_dict(link) != to_dict(kind())
+        if is_set and name not in cfg.motors.chain:
+            yield f"motors.{name} has no effect: motors.chain lacks '{name}'"
