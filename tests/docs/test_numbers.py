@@ -221,6 +221,11 @@ def test_students():
     older = of_worst_kind(f"student, seed {seed}" for seed in (1, 2, 3))
     lstm = of_worst_kind(f"student, seed {seed}, lstm" for seed in (1, 2, 3, 4))
     assert len(lstm) == 8 and f"LSTMs ({lstm.min():.1f} to {lstm.max():.1f}%)" in text
+    longer, known = "student, 38abe66, 10 steps of history", "teacher, 38abe66"
+    seeing = of_worst_kind([longer], known)
+    assert len(seeing) == 5 and f"ten steps of history ({seeing.min():.1f} to {seeing.max():.1f}%; 38abe66" in text
+    went_on = [f"{longer}, 60 million, PPO {how}" for how in ("1e-4", "3e-5", "1e-4 and std 0.2")]
+    assert (of_worst_kind(went_on, known) > of_worst_kind([f"{longer}, 60 million"], known).item()).all()
     equal = of_worst_kind(["student, 120 million"])
     through = of_worst_kind(["student, 48 steps"])
     assert (through > 0.9 * older.groupby(level=[0, 1, 2]).max().reindex(through.index)).all()
