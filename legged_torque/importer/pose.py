@@ -13,7 +13,7 @@ from legged_torque.importer.source import Source
 TIPPING = 2.3  # stiffness of legs, as a multiple of that below which a level trunk tips over its feet: weight times
 # height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3
 SAG = 0.2  # largest deflection of a joint under the robot's weight [rad]
-RETARDATION = 0.025  # damping per stiffness, as of all robots that come along [s]
+RETARDATION = 0.025  # damping per stiffness, as of the quadrupeds that come along [s]
 STABLE = 0.5  # damping per inertia and physics step, up to which torques of the step before still damp
 STEP = 0.005  # physics step [s]
 BANDWIDTH = 4.0  # natural frequency of joints off the legs, with the inertia that they move [Hz]

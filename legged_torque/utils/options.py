@@ -42,11 +42,11 @@ class Options:
         aliases=("--sim_device", "--rl_device"),  # of legged_gym, where they may differ
     )
     num_envs: Worlds | None = _option(
-        "number of worlds, in each process of several, as of torchrun or the preset laptop; default: that of the task"
+        "worlds, in each process of several, as of torchrun or the preset laptop; default: that of the task or script"
     )
-    seed: Number | None = _option("random seed; default: that of the training settings")
+    seed: Number | None = _option("random seed; default: that of the training settings; to play and evaluate: 1")
     preset: str | None = _option(
-        "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (three times as long), "
+        "training settings: parallel (the default on a GPU), laptop (that on a CPU), thorough (330 million steps), "
         "paper (Table II), flashsac (another learner) or student (imitates distillation.teachers)"
     )
     perturbation: str | None = _option(
@@ -69,11 +69,11 @@ class Options:
     run_name: str | None = _option("added to the name of the run's folder")
     logger: str | None = _option("where curves are written: tensorboard, wandb or none")
     load_run: str | None = _option("run to load: name of its folder or a path; default, and -1: the last one")
-    policy: str | None = _option("bundled policy in place of a run, such as go2/torque_multihead; see policies.py")
+    policy: str | None = _option("bundled policy, such as go2/torque_multihead, in place of a run; not to train")
     checkpoint: Number | None = _option("checkpoint to load; default, and -1: the last one")
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
-    max_iterations: Count | None = _option("iterations, those before a resume included; default: 110e6 steps, CPU 20e6")
+    max_iterations: Count | None = _option("iterations, those before a resume included; default: runner.total_steps")
 
     def __post_init__(self) -> None:
         """Take -1 for the last run and the last checkpoint, as legged_gym does."""
