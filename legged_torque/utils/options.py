@@ -73,7 +73,7 @@ class Options:
     checkpoint: Number | None = _option("checkpoint to load; default, and -1: the last one")
     resume: bool = _option("continue a run, with its settings", False)
     verbose: bool = _option("print rsl_rl's block of numbers after every iteration", False)
-    max_iterations: Count | None = _option("iterations, those before a resume included; default: runner.total_steps")
+    max_iterations: Count | None = _option("iterations, those before a resume included; default: by runner.total_steps")
 
     def __post_init__(self) -> None:
         """Take -1 for the last run and the last checkpoint, as legged_gym does."""

@@ -252,7 +252,7 @@ def test_recording_without_a_renderer(opened, page):
 
 def test_phone(opened, session):
     """The sheet is as wide as the page; the plots, at its top, can be unfolded; both robots are above it."""
-    session.reset()  # on a slow machine, the tests before let them walk apart
+    session.reset()  # on a slow machine, the tests before may let them walk apart
     walk(session, 0.1)
     with screen(opened, 390, 844, 0.25, mobile=True):
         open_page(opened, opened.current_url)
