@@ -1,9 +1,5 @@
 """Measure speed and memory of training: ``python scripts/benchmark.py --num_envs 1024 4096``."""
 
-import os
-
-os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or torch's profiler writes to standard error when it starts
-
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -42,16 +38,8 @@ def main() -> None:
     parser.add_argument("--preset", help="training settings: parallel (the default) or paper (Table II)")
     parser.add_argument("--rounds", type=int, default=10, help="how often each part is timed; default: %(default)s")
     parser.add_argument("--json", type=Path, help="file to write")
-    hint = "write a trace of a few iterations for ui.perfetto.dev, as .json or .json.gz"
-    parser.add_argument("--profile", type=Path, help=hint)
     args = parser.parse_args()
     cli.check_args(args, rounds=Count)
-    if args.profile and len(args.num_envs or [None]) > 1:
-        raise UserError("--profile writes one trace: give one number of worlds")
-    if args.profile and not args.profile.name.endswith((".json", ".json.gz")):
-        raise UserError(f"--profile needs a name that ends in .json or .json.gz, not '{args.profile}'")
-    if args.profile and args.json and args.profile.resolve() == args.json.resolve():
-        raise UserError(f"--json and --profile would both write '{args.json}'")
     if args.num_envs and any(item.startswith("env.num_envs=") for item in args.set):
         raise UserError("--num_envs and --set env.num_envs cannot be given together")
     changes = ["evaluation.interval=0", *args.set]  # without evaluations iterations are alike
@@ -63,8 +51,8 @@ def main() -> None:
             check_env_cfg(sizes[-1][0])  # report mistakes in any size before the first one is measured
         device = resolve_device(args.device)
         from legged_torque.benchmark.measure import MemoryMeter, measure
-    for file in filter(None, (args.json, args.profile)):
-        cli.check_output(file)
+    if args.json:
+        cli.check_output(args.json)
     result = {"task": args.task, "device": device_name(device), "versions": package_versions(), "rounds": args.rounds}
     result |= {"preset": args.preset or "parallel", "perturbation": args.perturbation or "none"}
     result |= {"ranges": args.ranges or "default", "motors": args.motors or "default", "set": without_machine(args.set)}
@@ -77,7 +65,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for cfgs in sizes:
         try:
-            row = measure(args.task, cfgs, memory, args.rounds, args.profile)
+            row = measure(args.task, cfgs, memory, args.rounds)
         except Exception as error:
             if not is_out_of_memory(error):
                 raise
@@ -86,8 +74,6 @@ def main() -> None:
         rows.append(row | {"left_memory_mib": memory.used()})
         cells = [f"{row[key]:>{len(title)},.{digits}f}" for key, (title, digits) in COLUMNS.items() if key in row]
         print(" | ".join([*cells, *([row["error"]] if "error" in row else [])]), flush=True)
-        if "profile" in row:
-            print(*row["profile"], f"The trace is in {args.profile}; Warp's kernels show on a GPU only.", sep="\n")
         if args.json:
             write_json(args.json, result | {"rows": rows})
 

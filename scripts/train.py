@@ -27,7 +27,7 @@ from legged_torque.envs.tasks import list_tasks
 from legged_torque.motors.model_config import ASSUMED_VOLTAGE
 from legged_torque.utils import cli, distributed
 from legged_torque.utils.config import Section, flat, section_keys, to_dict
-from legged_torque.utils.devices import busy_cores_note, device_name, resolve_device
+from legged_torque.utils.devices import device_name, resolve_device
 from legged_torque.utils.errors import TrainingError, UserError, counted
 from legged_torque.utils.limits import Number
 from legged_torque.utils.options import CPU_PRESET, DEFAULT_PRESET, DEFAULT_TASK, Options, without_effect
@@ -167,8 +167,6 @@ def learns_in_parts(train_cfg: Any) -> bool:
 
 def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer) -> None:
     """Build the task and train it, from a pre-trained policy if the task has one."""
-    import torch
-
     from legged_torque.deploy.export import export_note
     from legged_torque.envs.base.held_pose import standing_note
     from legged_torque.envs.base.legged_robot import LeggedRobot
@@ -208,8 +206,7 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
         print_notes([also_note(train_cfg.evaluation, steps)])
         if env.device == "cpu":
             is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
-            threads = max(torch.get_num_threads(), distributed.world_size())
-            print_notes(["" if is_short else length_note(train_cfg), busy_cores_note(threads)])
+            print_notes(["" if is_short else length_note(train_cfg)])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False

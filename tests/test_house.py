@@ -23,27 +23,27 @@ LEVELS = [
 LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVELS) for part in level}
 MAX_LINES = 400  # of a file
 LINES = {
-    "legged_torque/benchmark": 219,
+    "legged_torque/benchmark": 193,
     "legged_torque/deploy": 1578,
-    "legged_torque/envs": 5466,
+    "legged_torque/envs": 5491,
     "legged_torque/experiments": 1130,
     "legged_torque/identification": 459,
-    "legged_torque/importer": 1301,
-    "legged_torque/learning": 4539,
+    "legged_torque/importer": 1295,
+    "legged_torque/learning": 4541,
     "legged_torque/motors": 1558,
     "legged_torque/runtime": 2196,
     "legged_torque/sensors": 320,
     "legged_torque/sim": 5947,
     "legged_torque/terrain": 580,
-    "legged_torque/utils": 3545,
+    "legged_torque/utils": 3561,
     "legged_torque/viewer": 2513,
-    "scripts": 2091,
+    "scripts": 2074,
     "paper": 3238,
     "tools": 1484,
-    "tests": 27993,
+    "tests": 28058,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 33_487  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 33_481  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

@@ -8,7 +8,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
 from statistics import median
 from typing import Any
 from unittest.mock import patch
@@ -21,12 +20,10 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.learning.runner import OnPolicyRunner
 from legged_torque.sim.graph import CudaGraph, prepare_device
-from legged_torque.utils.files import write_whole
 from legged_torque.utils.progress import CompileProgress
 from legged_torque.utils.task_registry import set_seed
 
 WARM_UP = 2  # iterations before timing begins: the first one compiles, the second one captures the rollout
-TRACED = 2  # iterations in a trace, after one to warm up
 PHYSICS_STEPS = 5
 """Control steps of physics timed in a row: enough to hide the cost of the reset before them, and no robot falls yet."""
 ACTION_SCALE = 0.5  # standard deviation of the random actions while env.step is timed
@@ -72,10 +69,10 @@ class MemoryMeter:
             torch.cuda.empty_cache()
 
 
-def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, trace: Path | None) -> dict[str, Any]:
+def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int) -> dict[str, Any]:
     """Measure one task of one size; ``cfgs`` are the settings of the task and of its training.
 
-    Timed are ``rounds`` iterations, and physics and step as often. ``trace`` is a file for some iterations, or None.
+    Timed are ``rounds`` iterations, and physics and step as often.
 
     Returns:
         The numbers, by names that end in their units; see :func:`summarize`.
@@ -91,8 +88,6 @@ def measure(task_name: str, cfgs: tuple, memory: MemoryMeter, rounds: int, trace
         peak = max(*used, memory.used())
         row = summarize(times, *time_physics(task, rounds), task.num_envs, cfgs[1].runner.num_steps_per_env)
         row["peak_memory_mib"] = peak
-        if trace:
-            row["profile"] = trace_iterations(runner, trace)
     return row
 
 
@@ -122,14 +117,12 @@ def time_iterations(runner: OnPolicyRunner, count: int, at_start: Callable[[int]
         if at_start:
             at_start(len(marks) // 3)
         marks.append(time.perf_counter())
-        with torch.profiler.record_function("rollout"):
-            collect()
+        collect()
 
     def timed_update() -> dict[str, float]:
         """Update, and mark start and end."""
         marks.append(time.perf_counter())
-        with torch.profiler.record_function("update"):
-            losses = update()
+        losses = update()
         marks.append(time.perf_counter())
         return losses
 
@@ -197,22 +190,3 @@ def summarize(times: Times, physics: float, step: float, num_envs: int, num_step
         "iteration_max_ms": max(times["iteration"]),
         "iteration_steps_per_s": _MS * num_envs * num_steps / medians["iteration"],
     }
-
-
-def trace_iterations(runner: OnPolicyRunner, file: Path) -> list[str]:
-    """Write a trace of two iterations for Perfetto or Chrome (.json or .json.gz).
-
-    Returns:
-        Lines of a table of the most expensive kernels on a GPU, or operators of torch on a CPU.
-    """
-    cuda, activity = torch.device(runner.device).type == "cuda", torch.profiler.ProfilerActivity
-    activities = [activity.CPU, activity.CUDA] if cuda else [activity.CPU]
-    schedule = torch.profiler.schedule(wait=0, warmup=1, active=TRACED, repeat=1)
-    with torch.profiler.profile(activities=activities, schedule=schedule) as profiler:
-        time_iterations(runner, 1 + TRACED, lambda number: profiler.step() if number else None)
-    with tempfile.TemporaryDirectory() as folder:
-        part = Path(folder, file.name)
-        profiler.export_chrome_trace(str(part))
-        write_whole(file, part.read_bytes())
-    order = "self_device_time_total" if cuda else "self_cpu_time_total"
-    return profiler.key_averages().table(sort_by=order, row_limit=10).splitlines()

@@ -35,6 +35,7 @@ from legged_torque.deploy.policy import (
 )
 from legged_torque.envs.base.commands import HEADING_GAIN, UniformCommands
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.motors.config import PerturbationCfg
 from legged_torque.motors.delay import ActionDelay
 from legged_torque.motors.models import ModelMotor
 from legged_torque.motors.motor import Motor
@@ -67,6 +68,7 @@ def nominal_cfg(cfg: Any) -> Any:
     """Turn off all randomization in a task's settings, in place, for :func:`export_policy`."""
     cfg.env.num_envs = 4
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = False
+    cfg.motors.chain = [n for n in cfg.motors.chain if not isinstance(getattr(cfg.motors, n, None), PerturbationCfg)]
     return cfg
 
 
@@ -225,10 +227,9 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
     for joint, axis in zip(task.dof_names, task.asset.dof_axes(), strict=True):
         own, keys = mj_model.joint(joint), ("damping", "armature", "frictionloss")
         passive = {key: float(getattr(own, key)[0]) for key in keys}
-        joints[joint] = {"axis": [round(float(part), 6) + 0.0 for part in axis], **passive}
-        joints[joint] |= {"max_velocity": float(asset.max_dof_vel)}
+        axis = [round(float(part), 6) + 0.0 for part in axis]
+        joints[joint] = {"axis": axis, **passive, "max_velocity": float(asset.max_dof_vel)}
         joints[joint] |= {"range": own.range.tolist()} if mj_model.jnt_limited[own.id] else {}
-    observations = {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)}
     description: dict[str, Any] = {
         "format_version": FORMAT_VERSION,
         "task": name,
@@ -243,7 +244,7 @@ def describe(task: LeggedRobot, model: MLPModel, name: str, training: dict[str, 
         "joint_order": list(task.dof_names),
         "nominal_pose": _by_joint(task, task.default_dof_pos),
         "nominal_trunk_height": cfg.rewards.base_height_target,
-        "observations": observations,
+        "observations": {"history_length": cfg.env.history_length, "terms": _observation_terms(task, model)},
         "actions": {"clip": [-clip, clip], "terms": _action_terms(task)},
         "gains": {"stiffness": _by_joint(task, task.p_gains[0]), "damping": _by_joint(task, task.d_gains[0])},
         "torque_limits": _by_joint(task, task.torque_limits.T),
@@ -284,8 +285,7 @@ def _memory(model: MLPModel) -> dict[str, Any]:
         return {}
     network: Any = model.as_onnx(verbose=False)
     ends = zip(network.input_names[1:], network.output_names[1:], network.get_dummy_inputs()[1:], strict=True)
-    memory = [{"input": i, "output": o, "layers": len(state), "size": state.shape[2]} for i, o, state in ends]
-    return {"memory": memory}
+    return {"memory": [{"input": i, "output": o, "layers": len(h), "size": h.shape[2]} for i, o, h in ends]}
 
 
 def _latency(task: LeggedRobot, motors: dict[str, Any]) -> dict[str, Any]:

@@ -191,7 +191,7 @@ def further_robots() -> Iterator[tuple[str, Any, Any]]:
 PURPOSES = {
     "position": "joint positions under PD control",
     "torque": "joint torques",
-    "torque_damped": "torques, bear latency on a plane",
+    "torque_damped": "torques, damped drives, latency",
     "torque_gravity": "torques, from a policy that stands",
     "torque_curriculum": "torques, nominal pose comes first",
     "torque_multihead": "positions + torques, PD down to 0",

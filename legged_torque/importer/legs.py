@@ -10,7 +10,7 @@ import numpy as np
 from legged_torque.importer.shapes import ROUND, Shape, box_around, fit_geom, fit_inertia
 from legged_torque.importer.source import Source
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mjcf import body_chains
+from legged_torque.utils.mjcf import body_chains, zero_pose
 
 TOLERANCE = 0.01  # distance by which mirror images may miss each other [m]
 PARALLEL = 0.9  # least |cosine| of the angle between axes that count as parallel
@@ -35,16 +35,6 @@ class Leg:
     bodies: list[int]
     foot: Shape  # in the frame of the last body
     has_sole: bool  # whether it has an ankle, so that a flat foot stays flat
-
-
-def zero_pose(model: mujoco.MjModel, joints: np.ndarray | None = None) -> mujoco.MjData:
-    """Return the state with the trunk level at the origin and these angles [rad] of the joints (default: 0)."""
-    data = mujoco.MjData(model)
-    data.qpos[:7] = 0, 0, 0, 1, 0, 0, 0
-    data.qpos[7:] = 0.0 if joints is None else joints
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    return data
 
 
 def pitch_axis(axes: np.ndarray) -> np.ndarray:

@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 from mujoco.minimize import least_squares
 
-from legged_torque.importer.legs import PARALLEL, Leg, lowest_point, pitch_axis, zero_pose
+from legged_torque.importer.legs import PARALLEL, Leg, lowest_point, pitch_axis
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source
+from legged_torque.utils.mjcf import zero_pose
 
 TIPPING = 2.3  # stiffness of legs, as a multiple of that below which a level trunk tips over its feet: weight times
 # height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3

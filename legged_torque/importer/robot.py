@@ -18,13 +18,13 @@ from legged_torque.importer.legs import (
     joint_names,
     lowest_point,
     mirrored_legs,
-    zero_pose,
 )
 from legged_torque.importer.pose import Stance, find_stance
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source, read_source
 from legged_torque.utils.errors import UserError, collect_errors
-from legged_torque.utils.mirroring import counterparts
+from legged_torque.utils.mirroring import Mirroring, counterparts, mirror_signs
+from legged_torque.utils.mjcf import joint_axes, zero_pose
 from legged_torque.utils.standing import hold_pose
 
 UNLIMITED = np.pi  # range of joints without one, to both sides [rad]
@@ -95,7 +95,10 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     prefixes = [leg.name + "_" for leg in legs]
     asymmetries: list[str] = []
     with collect_errors(asymmetries):
-        counterparts(joints, mirrored)
+        order = counterparts(joints, mirrored)
+        image = Mirroring(order, mirror_signs(joints, joint_axes(source.model)[1:], order))
+        pair = image.unlike(stance.angles, joints)
+        asymmetries += [f"the nominal pose has {pair}"] if pair else []
     source.notes += [f"training without mirror images: {reason}" for reason in asymmetries]
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]

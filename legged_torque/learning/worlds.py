@@ -11,6 +11,7 @@ from typing import Any
 from legged_torque.learning import checkpoint
 from legged_torque.learning.protocols import Stateful
 from legged_torque.utils import distributed
+from legged_torque.utils.buffers import check_state
 from legged_torque.utils.display import warn
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.policies import sha256
@@ -69,6 +70,7 @@ class Worlds:
             raise UserError(f"{len(processes)} processes have trained, now there are {distributed.world_size()}")
         state = processes[distributed.rank()]
         try:
+            check_state(self._task.world_state_dict(), state["worlds"])  # before anything goes on
             for other in self._others:
                 other.load_state_dict(state)
             for name, owner in self._owners.items():

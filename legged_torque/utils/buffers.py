@@ -69,6 +69,14 @@ def copy_state(target: dict[str, Any], source: Any) -> None:
 
     The tensors of ``target`` are written in place. A UserError names an entry that does not fit; then nothing changes.
     """
+    check_state(target, source)
+    values = flat(source)
+    for path, tensor in flat(target).items():
+        tensor.copy_(values[path])
+
+
+def check_state(target: dict[str, Any], source: Any) -> None:
+    """Raise a UserError, which names an entry, if :func:`copy_state` cannot copy one state to the other."""
     tensors, values = flat(target), flat(source)
     if tensors.keys() != values.keys():
         different = sorted(tensors.keys() ^ values.keys())
@@ -77,5 +85,3 @@ def copy_state(target: dict[str, Any], source: Any) -> None:
         value = values[path]
         if not isinstance(value, Tensor) or (value.shape, value.dtype) != (tensor.shape, tensor.dtype):
             raise UserError(f"the state '{path}' is not of the shape {tuple(tensor.shape)} and the type {tensor.dtype}")
-    for path, tensor in tensors.items():
-        tensor.copy_(values[path])

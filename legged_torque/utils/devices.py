@@ -6,16 +6,12 @@ import importlib.util
 import math
 import os
 import re
-import time
 from pathlib import Path
 
 from legged_torque.utils import distributed
 from legged_torque.utils.errors import UserError, counted, unknown_name
 
-COUNTS = Path("/proc/stat")  # Linux's times of the cores
 MEMORY = Path("/proc/meminfo")  # and its memory
-MANY = 0.3  # busy cores from which on others are in the way
-SECONDS = 0.3  # of observing them
 INSTALL_HINT = "on Debian: apt-get install libosmesa6, then MUJOCO_GL=osmesa"
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 
@@ -64,30 +60,6 @@ def free_memory(device: str) -> float:
         lines = MEMORY.read_text().splitlines()
         return 1024.0 * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
     return math.inf
-
-
-def busy_cores() -> float:
-    """Return how many cores other processes use, while this one sleeps a moment; 0 elsewhere than on Linux."""
-    with contextlib.suppress(OSError, ValueError):
-        seconds = []  # for which all cores together have been busy since the start of the machine
-        for wait in (0.0, SECONDS):
-            time.sleep(wait)
-            ticks = [int(number) for number in COUNTS.read_text().split("\n", 1)[0].split()[1:9]]
-            seconds.append((sum(ticks) - sum(ticks[3:5])) / os.sysconf("SC_CLK_TCK"))  # but idle or waiting for disks
-        return (seconds[1] - seconds[0]) / SECONDS
-    return 0.0
-
-
-def busy_cores_note(threads: int) -> str:
-    """Return a note on training in so many threads while other processes use the cores; empty if enough are free."""
-    cores = os.cpu_count() or 1
-    others = busy_cores() if threads > 1 else 0.0
-    if others < MANY or threads <= cores - others:
-        return ""
-    return (
-        f"other processes use {others:.1f} of {cores} cores, and training has {threads} threads, which wait for each "
-        f"other: OMP_NUM_THREADS={max(int(cores - others), 1)} is likely faster"
-    )
 
 
 def disable_renderer() -> None:

@@ -3,7 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from legged_torque.utils.errors import UserError
+
+MIRROR_TOLERANCE = 5e-3  # by which feet [m], angles [rad] or gains up to 1 may miss the mirror images of others
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,14 @@ class Mirroring:
         """Return the same permutation of values that keep their signs, such as masses."""
         return Mirroring(self.order, (1.0,) * len(self.order))
 
+    def unlike(self, values: np.ndarray, names: Sequence[str]) -> str:
+        """Return the value by which the mirror image differs most, and its counterpart's; empty if it does nowhere."""
+        misses = np.abs(values[list(self.order)] * self.signs - values)
+        worst = int(misses.argmax())
+        if misses[worst] <= MIRROR_TOLERANCE * max(1.0, np.abs(values).max()):
+            return ""
+        return " and ".join(f"{values[place]:g} for '{names[place]}'" for place in sorted((worst, self.order[worst])))
+
     def of_vectors(self, each: "Mirroring") -> "Mirroring":
         """Return the mirroring of one vector per entry, each of which is mirrored by ``each``."""
         size = len(each.order)
@@ -62,3 +74,21 @@ def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -
             raise UserError(f"'{name}' has no counterpart '{other}' on the other side")
         result.append(list(names).index(other))
     return tuple(result)
+
+
+def mirror_signs(
+    names: Sequence[str], axes: Sequence[Sequence[float]] | np.ndarray, order: Sequence[int]
+) -> tuple[float, ...]:
+    """Return whether mirrored angles have the other sign: a turn about (x, y, z) becomes one about (-x, y, -z).
+
+    A UserError if the axes of two counterparts, in the trunk's frame where all angles are 0, do not allow that.
+    """
+    signs = []
+    for name, axis, other in zip(names, axes, order, strict=True):
+        alike = sum(
+            sign * part * image for sign, part, image in zip(AXIAL_VECTOR.signs, axes[other], axis, strict=True)
+        )
+        if abs(alike) < 0.999:
+            raise UserError(f"the axes of '{name}' and '{names[other]}' are not mirror images of each other")
+        signs.append(1.0 if alike > 0.0 else -1.0)
+    return tuple(signs)

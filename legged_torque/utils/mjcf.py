@@ -128,11 +128,19 @@ def torque_range(model: mujoco.MjModel, motor: int) -> tuple[float, float]:
 
 def joint_axes(model: mujoco.MjModel) -> np.ndarray:
     """Return the axes of all joints in the frame of a level trunk, all angles being 0. Shape: (njnt, 3)."""
+    return zero_pose(model).xaxis.copy()
+
+
+def zero_pose(model: mujoco.MjModel, joints: np.ndarray | None = None) -> mujoco.MjData:
+    """Return the state with the trunk level at the origin and these angles [rad] of the joints (default: 0)."""
     data = mujoco.MjData(model)
     data.qpos[:] = 0.0
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE] + 3] = 1.0
+    if joints is not None:
+        data.qpos[7:] = joints
     mujoco.mj_kinematics(model, data)
-    return data.xaxis.copy()
+    mujoco.mj_comPos(model, data)
+    return data
 
 
 def robot_notes(file: Path, trained: Path) -> Iterator[str]:

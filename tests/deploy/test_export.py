@@ -349,7 +349,9 @@ def test_nominal_settings():
     """A run with randomization is exported with the gains and scales of its settings."""
     cfg, _ = task_registry.get_cfgs("a1_position")
     cfg.domain_rand.randomize_parameters = cfg.domain_rand.push_robots = cfg.noise.add_noise = True
+    cfg.motors.chain = ["delay", "perturbation", "ideal"]
     cfg = nominal_cfg(cfg)
+    assert cfg.motors.chain == ["delay", "ideal"]
     assert not (cfg.domain_rand.randomize_parameters or cfg.domain_rand.push_robots or cfg.noise.add_noise)
 
 

@@ -186,6 +186,41 @@ def test_mirror_images_follow_axes(changed, make_task):
     assert np.abs(moved[0][[1, 3, 5]]).min() > 0.03
 
 
+def with_turned_calf(degrees):
+    """A change that turns the frame of the right front calf about its z axis, and nothing else of the leg."""
+    half, whole = np.radians(degrees) / 2, np.radians(degrees)
+    turned = setting(".//body[@name='FR_calf']", quat=f"{np.cos(half)} 0 0 {np.sin(half)}")
+    return [turned, joint("FR_calf_joint", axis=f"{np.sin(whole)} {np.cos(whole)} 0")]
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 180])
+def test_mirror_images_of_places_of_feet(changed, make_task, degrees):
+    """Feet that are moved in frames that are no mirror images are mirror images of each other in plain MuJoCo."""
+    file = changed(*with_turned_calf(degrees))
+    task = make_task("a1_torque", 1, **{"asset.file": file, "domain_rand.randomize_parameters": True})
+    joints, feet = task.symmetry.joints, task.parameter_mirrors["foot_pos"]
+    rng, found = np.random.default_rng(3), []
+    moved, angles = rng.uniform(-0.05, 0.05, 12), np.array([*POSE.values()]) + rng.uniform(-0.2, 0.2, 12)
+    image = angles[list(joints.order)] * joints.signs, moved[list(feet.order)] * feet.signs
+    for pose, move in ((angles, moved), image):
+        model = mujoco.MjModel.from_xml_path(file)
+        geoms = [model.geom(name).id for name in task.foot_names]
+        model.geom_pos[geoms] += move.reshape(4, 3)
+        data = mujoco.MjData(model)
+        data.qpos[7:] = pose
+        mujoco.mj_kinematics(model, data)
+        found.append(data.geom_xpos[geoms])
+    np.testing.assert_allclose(found[1][[1, 0, 3, 2]], found[0] * (1, -1, 1), atol=1e-9)
+
+
+def test_feet_between_axes(changed, make_task):
+    """In frames that differ by less than a quarter turn, feet that are moved have no mirror image."""
+    task = make_task("a1_torque", 1, **{"asset.file": changed(*with_turned_calf(30))})
+    assert task.mirror
+    settings = {"asset.file": task.cfg.asset.file, "domain_rand.randomize_parameters": True}
+    assert "random parameter 'foot_pos' is not known" in error_of(lambda: make_task("a1_torque", 1, **settings).mirror)
+
+
 def test_unlike_sides_are_no_mirror_images(changed, make_task):
     """A leg at another place, or with another axis, has no mirror image."""
     task = make_task("a1_torque", 1, **{"asset.file": changed(setting(".//body[@name='FL_calf']", pos="0 0 -0.25"))})

@@ -5,11 +5,12 @@ import math
 import pytest
 import torch
 from support.control import mirror_joints, mirror_policy
-from support.settings import build_runner, get_cfgs
+from support.settings import build_runner, error_of, get_cfgs
 from tensordict import TensorDict
 from torch import nn
 
 from legged_torque.envs.approaches.torque import TorqueRobot
+from legged_torque.envs.base.legged_robot import LeggedRobot
 from legged_torque.envs.base.observations import ObservationTerm
 from legged_torque.envs.base.symmetry import with_mirror_images
 from legged_torque.envs.tasks import A1TorqueCfg
@@ -102,6 +103,29 @@ def test_counterparts():
         counterparts(["FR_hip", "left_hip"], pairs)
     with pytest.raises(UserError, match="'RL_hip' has no counterpart: asset"):
         counterparts(["RL_hip"], pairs)
+
+
+UNLIKE = {
+    "init_state.default_joint_angles.FL_hip_joint=0.5": (-0.1, 0.5),
+    "control.stiffness={FR: 20, FL: 60, R: 20}": (20, 60),
+    "control.damping={FR: 0.5, F: 1, R: 0.5}": (0.5, 1),
+}
+
+
+@pytest.mark.parametrize("change", UNLIKE)
+def test_settings_of_one_side(change):
+    """A pose or gains that differ between left and right leave no mirror image: the same action is other torques."""
+    cfg, _ = get_cfgs("--num_envs=1", f"--set={change}", task="a1_position")
+    message = error_of(lambda: LeggedRobot(cfg).mirror)
+    assert "has {} for 'FR_hip_joint' and {} for 'FL_hip_joint'".format(*UNLIKE[change]) in message
+    assert message.startswith(change[:14]) and "symmetry_cfg.use_data_augmentation=false" in message
+
+
+def test_offsets_to_one_side(make_task):
+    """Hips that every draw turns to the left have no mirror image among the draws."""
+    ranges = {"domain_rand.joint_offset": {"add": [0.0, 0.02]}}
+    message = error_of(lambda: make_task("a1_position", 1, **ranges).mirror)
+    assert "random parameter 'joint_offset' is not known, or leaves its range" in message
 
 
 @pytest.fixture(scope="module")

@@ -106,6 +106,19 @@ def test_menagerie(written):
     check(model, cfg)
 
 
+@pytest.mark.parametrize(("left", "right", "fits"), [(0.1, -0.1, True), (0.1, 0.1, False), (0.0, -0.1, False)])
+def test_a_keyframe_of_two_sides(written, left, right, fits):
+    """Hips that both lean to the left, or one alone, are no mirror images: such a robot trains without."""
+    source = as_menagerie().replace("1 0 0 0 0 0.9 -1.8 0", f"1 0 0 0 {left} 0.9 -1.8 {right}")
+    robot, _, _ = written(source, "xml")
+    assert robot.stance.angles[[0, 3]].tolist() == [left, right]
+    notes = [note for note in robot.source.notes if "without mirror images" in note]
+    assert robot.symmetric == fits and ("use_data_augmentation" in settings(robot)) == fits
+    assert [f"pose has {left:g} for 'FL_hip_joint' and {right:g} for 'FR_hip_joint'" in note for note in notes] == (
+        [] if fits else [True]
+    )
+
+
 def test_training(written):
     """An imported robot trains three iterations with random parameters; nothing is said of another robot's ranges."""
     _, _, cfg = written(urdf(), "urdf")

@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from legged_torque.envs import task_registry
 from legged_torque.envs.tasks import A1TorqueCfgPPO
+from legged_torque.learning import checkpoint
 from legged_torque.learning.flashsac import FlashSAC
 from legged_torque.learning.flashsac.exploration import RepeatedNoise
 from legged_torque.learning.flashsac.networks import Trunk, UnitBatchNorm, UnitLinear, bound_weights, squashed
@@ -97,6 +98,21 @@ def test_resume(tmp_path, capsys, save):
     assert len(parts) == 4 and all(same) == save
     assert (whole["num_updates"], resumed["num_updates"]) == (24, 24 if save else 16)
     assert ("The replay starts empty" in capsys.readouterr().out) != save
+
+
+def test_worlds_that_do_not_fit(tmp_path, capsys):
+    """The replay starts anew with the worlds: its last step and the first of other worlds are none of one episode."""
+    trainer = make("flashsac.save_replay=true", folder=tmp_path)
+    trainer.learn(2)
+    state = torch.load(tmp_path / "model_2.pt", weights_only=True)
+    worlds = torch.load(tmp_path / "worlds_2.pt", weights_only=True)
+    worlds["processes"][0]["worlds"]["of_an_earlier_version"] = torch.zeros(1)
+    state["infos"]["worlds"] = checkpoint.write(tmp_path / "worlds_2.pt", worlds)
+    torch.save(state, tmp_path / "model_2.pt")
+    resumed = make("flashsac.save_replay=true")
+    resumed.resume(str(tmp_path / "model_2.pt"))
+    assert "start anew, and what the learner keeps of them: " in capsys.readouterr().out
+    assert int(trainer.alg.replay.count) > 0 and int(resumed.alg.replay.count) == 0
 
 
 @pytest.mark.parametrize(("rows", "steps", "fits"), [(6, 9, True), (8, 5, True), (8, 9, False), (4, 5, False)])

@@ -176,7 +176,8 @@ def test_refused(edit, reason):
         read_tree(model)
     message = str(error.value)
     assert message.startswith("sim.engine 'fused' cannot simulate this robot: ") and reason in message
-    assert message.endswith("; use sim.engine = 'mujoco_warp', about 30 times slower, without randomize_parameters")
+    advice = "; use sim.engine = 'mujoco_warp', in training about 8 times slower, without randomize_parameters"
+    assert message.endswith(advice)
 
 
 CALF_MEETS_THIGH = "spec.geom('FR_calf').contype = 2; spec.geom('FR_thigh').conaffinity |= 2"
@@ -221,7 +222,7 @@ def test_engine_that_is_slower():
         spec.delete(key)
     branch(spec.body("FL_thigh"))
     (note,) = make_engine("mujoco_warp", compiled(spec), 1).notes
-    assert note.startswith("sim.engine 'mujoco_warp' steps worlds, about 30 times slower than 'fused'")
+    assert note.startswith("sim.engine 'mujoco_warp' steps worlds, in training about 8 times slower than 'fused'")
     assert note.endswith("which cannot simulate this robot: body 'FL_thigh' branches")
 
 

@@ -82,16 +82,6 @@ def test_choice_of_the_renderer(asked, installed, gpu, chosen, monkeypatch):
         assert asked is None or asked in reason
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the counts are Linux's")
-def test_busy_cores(monkeypatch):
-    """A process that computes without end is seen."""
-    monkeypatch.setattr(devices, "SECONDS", 1.0)
-    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as other:
-        others = devices.busy_cores()
-        other.kill()
-    assert others > 0.4
-
-
 def test_portable_path(tmp_path, monkeypatch):
     """Paths below the current folder become relative, others a name; relative ones stay."""
     monkeypatch.chdir(tmp_path)

@@ -27,7 +27,7 @@ from legged_torque.envs.base.random_parameters import (
 )
 from legged_torque.envs.base.reward_terms import RewardTerms
 from legged_torque.envs.base.rewards import Rewards
-from legged_torque.envs.base.robot_checks import range_notes
+from legged_torque.envs.base.robot_checks import control_problem, range_notes
 from legged_torque.envs.base.state import RobotState, StateAccess
 from legged_torque.envs.base.step_meter import StepMeter
 from legged_torque.envs.base.symmetry import Mirror
@@ -319,6 +319,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.control = ControlParameters(self.cfg.control, self.dof_names, pose, self.num_envs, self.device)
         limits = self.asset.mj_model.actuator_forcerange.T
         self.torque_limits = torch.tensor(limits, dtype=torch.float32, device=self.device)
+        self.symmetry.refuse(control_problem(self.symmetry.joints, self.dof_names, self.control))
         self._init_terminations(self.asset.terminating, self.device)
         self._init_reward_buffers(self.asset, self.device)
 
@@ -370,7 +371,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         drawn = with_settings(declared, rand, cfg.random_parameters())
         self.events = RandomEvents(cfg, self.sim, self.command_generator, angles, at_reset, drawn)
         self.randomization = self.events.parameters
-        self.parameter_mirrors = mirrors(drawn, self.randomization.sizes)
+        self.parameter_mirrors = mirrors(self.randomization, rand.randomize_parameters)
         if rand.randomize_parameters:
             self.notes += range_notes(drawn, self.randomization.fields, self.torque_limits[1].cpu().numpy())
 
@@ -388,7 +389,8 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         A UserError if the robot is not symmetric, or the mirror image of a term or of a random parameter is not known.
         """
         unknown = [name for name, mirroring in self.parameter_mirrors.items() if mirroring is None]
-        problem = f"the mirror image of the random parameter '{unknown[0]}' is not known" if unknown else ""
+        image = f"the mirror image of the random parameter '{unknown[0]}'" if unknown else ""
+        problem = f"{image} is not known, or leaves its range" if unknown else ""
         mirrors = self.observations.mirrors() | {"actions": self.control_law.mirrors(self.symmetry.joints)}
         return Mirror(mirrors, self.symmetry.problem or problem, self.device)
 

@@ -41,7 +41,7 @@ class LeggedRobotCfg(BaseConfig):
 
     class env:  # worlds and episodes
         num_envs: Worlds = 4096  # worlds of each process
-        num_envs_cpu: Worlds = 64  # default on a CPU, where a world-step costs about a millisecond
+        num_envs_cpu: Worlds = 64  # default on a CPU, where a world-step costs up to 0.3 ms
         num_actions: Count | None = None  # None: those of the approach for each joint of the robot
         history_length: Annotated[int, Limits(1, 1000)] = 1  # control steps that the policy sees, the newest first
         episode_length_s: Annotated[float, Limits(above=0, highest=1e6)] = 20.0  # [s]

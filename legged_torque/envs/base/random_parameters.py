@@ -5,16 +5,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
+import numpy as np
 from torch import Tensor
 
 from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
 from legged_torque.envs.base.symmetry import RobotSymmetry
-from legged_torque.sim.randomization import RandomParameter, fixed
+from legged_torque.sim.randomization import Randomization, RandomParameter, fixed
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.limits import Limits
-from legged_torque.utils.mirroring import SCALAR, VECTOR, Mirroring
-from legged_torque.utils.mjcf import joint_limits
+from legged_torque.utils.mirroring import MIRROR_TOLERANCE, VECTOR, Mirroring
+from legged_torque.utils.mjcf import joint_limits, zero_pose
 from legged_torque.utils.options import CONTACT
 
 TRUNK = 1  # the trunk's body
@@ -81,7 +82,7 @@ def robot_parameters(
     feet = [model.geom(name).id for name in foot_names]
     inertia_per_mass = list(model.body_inertia[TRUNK] / model.body_mass[TRUNK])
     joint_values = symmetry.joints and symmetry.joints.unsigned()
-    foot_vectors = symmetry.foot_geoms and symmetry.foot_geoms.of_vectors(VECTOR)
+    foot_vectors = symmetry.foot_geoms and _mirror_images_of_vectors(model, feet, symmetry.foot_geoms)
     are_round = set(model.geom_type[feet]) <= _ROUND
     foot_radius = draws["foot_radius"] if are_round or "scale" not in draws["foot_radius"] else {}
 
@@ -104,6 +105,21 @@ def robot_parameters(
         of_joints("dof_stiffness", "jnt_stiffness", joints, "N m/rad", control.p_gains[0].tolist()),
         of_joints("dof_frictionloss", "dof_frictionloss", dofs, "N m", torque_limits.tolist()),
     ]
+
+
+def _mirror_images_of_vectors(model: mujoco.MjModel, geoms: Sequence[int], of_geoms: Mirroring) -> Mirroring | None:
+    """Return the mirroring of a vector per geom, in its body's frame; None unless axes are images of axes."""
+    frames = zero_pose(model).xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
+    order: list[int] = []
+    signs: list[float] = []
+    for frame, other in zip(frames, of_geoms.order, strict=True):
+        image = frame.T @ np.diag(VECTOR.signs) @ frames[other]
+        if np.abs(image - image.round()).max() > MIRROR_TOLERANCE:
+            return None
+        axes = np.abs(image).argmax(axis=1)
+        order += (3 * other + axes).tolist()
+        signs += image.round()[range(3), axes].tolist()
+    return Mirroring(tuple(order), tuple(signs))
 
 
 def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[RandomParameter]:
@@ -193,16 +209,24 @@ def _refuse_mixed_solrefs(drawn: Sequence[RandomParameter]) -> None:
         )
 
 
-def mirrors(drawn: Sequence[RandomParameter], sizes: Mapping[str, int]) -> dict[str, Mirroring | None]:
-    """Return the mirror images of the numbers of :attr:`Randomization.values`, by name; None where it is not known.
+def mirrors(randomization: Randomization, is_random: bool) -> dict[str, Mirroring | None]:
+    """Return the mirror images of the numbers of :attr:`Randomization.values`, by name.
 
-    ``sizes`` says how many numbers of its own each of the drawn parameters has.
+    None where it is not known, unless the numbers never change, or where it leaves their range: signed numbers need
+    ranges around the robot's own value. ``is_random`` says whether anything will be drawn.
     """
-    own = [parameter for parameter in drawn if parameter.name in sizes]
-    for p in own:
-        if p.mirror and len(p.mirror.order) != sizes[p.name]:
-            raise UserError(f"the mirror image of the random parameter '{p.name}' must have {sizes[p.name]} numbers")
-    return {p.name: p.mirror or (SCALAR if sizes[p.name] == 1 else None) for p in own}
+    named, images, place = {p.name: p for p in randomization.parameters}, dict[str, Mirroring | None](), 0
+    for name, size in randomization.sizes.items():
+        parameter, at_start = named[name], randomization.values[0, place : place + size].cpu().numpy()
+        place += size
+        image = parameter.mirror
+        if image is None and (size == 1 or not (is_random and parameter.is_drawn)):
+            image = Mirroring.of_signs(*[1.0] * size)
+        if image and len(image.order) != size:
+            raise UserError(f"the mirror image of the random parameter '{name}' must have {size} numbers")
+        leaves = image and min(image.signs) < 0.0 and image.unlike(at_start, [name] * size)
+        images[name] = None if leaves else image
+    return images
 
 
 def entries(width: int, rows: Sequence[int]) -> list[int]:

@@ -75,7 +75,7 @@ class RewardTerms:
         return (self.state.last_actions - self.state.actions).square().sum(dim=1)
 
     def _reward_collision(self) -> Tensor:
-        """Number of calves, thighs and trunks that touch the ground."""
+        """Number of geoms of ``asset.penalize_contacts_on`` that touch something."""
         return self.state.contacts[:, self.penalized_contact_indices].sum(dim=1)
 
     def _reward_base_height(self) -> Tensor:

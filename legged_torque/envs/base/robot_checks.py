@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 from torch import Tensor
 
+from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import RandomParameter
-from legged_torque.utils.mirroring import Mirroring
-from legged_torque.utils.mjcf import body_chains, colliding_pairs, joint_limits
+from legged_torque.utils.mirroring import MIRROR_TOLERANCE, Mirroring
+from legged_torque.utils.mjcf import body_chains, colliding_pairs, joint_limits, zero_pose
 
-MIRROR_TOLERANCE = 5e-3  # by which a foot may miss the mirror image of its counterpart [m]
 _POSES = 5  # random ones that are mirrored
 
 
@@ -44,20 +44,31 @@ def floor_problems(model: mujoco.MjModel, feet: Sequence[str]) -> Iterator[str]:
 
 def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, foot_names: Sequence[str]) -> str:
     """Return how far mirrored joint angles miss mirrored places of the feet; empty if they do not."""
-    rng, data, places = np.random.default_rng(0), mujoco.MjData(model), []
+    rng, places = np.random.default_rng(0), []
     low, high = np.clip(joint_limits(model)[1:].T, -1.0, 1.0)
     geoms = [model.geom(name).id for name in foot_names]
     for _ in range(_POSES):
         angles = rng.uniform(low, high)
         for pose in (angles, angles[list(joints.order)] * joints.signs):
-            data.qpos[:7], data.qpos[7:] = (0, 0, 0, 1, 0, 0, 0), pose
-            mujoco.mj_kinematics(model, data)
-            places.append(data.geom_xpos[geoms].copy())
+            places.append(zero_pose(model, pose).geom_xpos[geoms])
         own, image = places[-2][list(feet.order)] * (1, -1, 1), places[-1]
         missed = np.linalg.norm(own - image, axis=1)
         if missed.max() > MIRROR_TOLERANCE:
             worst = foot_names[int(missed.argmax())]
             return f"mirrored angles put '{worst}' {missed.max():.3g} m away from the mirror image of its counterpart"
+    return ""
+
+
+def control_problem(joints: Mirroring | None, dof_names: Sequence[str], control: ControlParameters) -> str:
+    """Return which nominal angle or gain does not fit its counterpart; empty if all do, or joints have no images."""
+    if joints is None:
+        return ""
+    checks = {"init_state.default_joint_angles": (joints, control.default_dof_pos)}
+    checks["control.stiffness"] = joints.unsigned(), control.p_gains[0]
+    checks["control.damping"] = joints.unsigned(), control.d_gains[0]
+    for setting, (image, values) in checks.items():
+        if pair := image.unlike(values.cpu().numpy(), dof_names):
+            return f"{setting} has {pair}, which are not mirror images of each other"
     return ""
 
 

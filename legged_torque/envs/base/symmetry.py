@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque.utils.errors import UserError
-from legged_torque.utils.mirroring import AXIAL_VECTOR, Mirroring, counterparts
+from legged_torque.utils.mirroring import Mirroring, counterparts, mirror_signs
 
 Names = Sequence[str]
 
@@ -45,7 +45,7 @@ class RobotSymmetry:
         self.problem = ""
         try:
             order = counterparts(dof_names, mirrored_legs)
-            self.joints = Mirroring(order, _mirror_signs(dof_names, dof_axes, order))
+            self.joints = Mirroring(order, mirror_signs(dof_names, dof_axes, order))
             geoms_order = counterparts(foot_names, mirrored_legs)
             others = dict(zip(foot_of, (foot_of[place] for place in geoms_order), strict=True))
             self.foot_geoms = Mirroring(geoms_order, (1.0,) * len(geoms_order))
@@ -57,19 +57,6 @@ class RobotSymmetry:
         """Have no symmetry, because of a problem; empty if there is none."""
         if problem:
             self.joints, self.feet, self.foot_geoms, self.problem = None, None, None, problem
-
-
-def _mirror_signs(names: Names, axes: Sequence[Sequence[float]], order: Sequence[int]) -> tuple[float, ...]:
-    """Return whether mirrored angles have the other sign: a turn about (x, y, z) becomes one about (-x, y, -z)."""
-    signs = []
-    for name, axis, other in zip(names, axes, order, strict=True):
-        alike = sum(
-            sign * part * image for sign, part, image in zip(AXIAL_VECTOR.signs, axes[other], axis, strict=True)
-        )
-        if abs(alike) < 0.999:
-            raise UserError(f"the axes of '{name}' and '{names[other]}' are not mirror images of each other")
-        signs.append(1.0 if alike > 0.0 else -1.0)
-    return tuple(signs)
 
 
 def _place(names: Names, leg: str) -> int:
@@ -98,7 +85,8 @@ class Mirror:
             for name, mirroring in terms:
                 if mirroring is None:
                     reason = problem or f"the mirror image of '{name}' in '{kind}' is not known"
-                    raise UserError(f"algorithm.symmetry_cfg: {reason}")
+                    without = "algorithm.symmetry_cfg.use_data_augmentation=false trains without mirror images"
+                    raise UserError(f"{reason}; {without}")
                 if not mirroring.is_its_own_inverse():
                     raise UserError(f"mirrored twice, '{name}' in '{kind}' is not what it was")
             whole = Mirroring.joined([mirroring for _, mirroring in terms if mirroring])

@@ -24,7 +24,7 @@ class RoughScanCfg(RoughCfg):
 
 
 class RoughCfgPPO(LeggedRobotCfgPPO):
-    """Training on rough ground, which takes longer than on a plane."""
+    """Training on rough ground."""
 
     class runner:
         total_steps = 300_000_000

@@ -41,7 +41,7 @@ MIN_PARTS = 4
 MOST_PARTS = 4
 """Parts of a capsule, at most."""
 
-SLOWER = "about 30 times slower"  # on an H200, see docs/performance.md
+SLOWER = "in training about 8 times slower"  # on an H200, see docs/performance.md
 REFUSED = "sim.engine 'fused' cannot simulate this robot"
 ADVICE = f"use sim.engine = 'mujoco_warp', {SLOWER}, without randomize_parameters"
 FLOORS = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
