@@ -51,7 +51,7 @@ class Robot:
     torques: np.ndarray  # [N m]
     speed: float  # highest of the joints [rad/s]
     mirrored: list[list[str]]  # pairs of right and left legs
-    symmetric: bool  # whether every joint has a mirror image
+    symmetric: bool  # whether every joint has a mirror image, and the nominal pose is its own
     stance: Stance
 
     def by_kind(self, values: np.ndarray) -> dict[str, float]:
