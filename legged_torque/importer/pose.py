@@ -9,7 +9,7 @@ from mujoco.minimize import least_squares
 from legged_torque.importer.legs import PARALLEL, Leg, lowest_point, pitch_axis
 from legged_torque.importer.shapes import Shape
 from legged_torque.importer.source import Source
-from legged_torque.utils.mjcf import zero_pose
+from legged_torque.utils.mjcf import mass_matrix, zero_pose
 
 TIPPING = 2.3  # stiffness of legs, as a multiple of that below which a level trunk tips over its feet: weight times
 # height, shared by the legs. The robots that come along have 1.3 to 2.2, the ankles of the G1 0.3
@@ -63,10 +63,7 @@ def find_stance(
             f"{bare.sum()} joints without rotor inertia (armature): assumed 0.01 kg m^2 per 33.5 N m, as on the A1; "
             "put the motor's own there if you know it"
         )
-    mujoco.mj_crb(model, data)
-    matrix = np.zeros((model.nv, model.nv))
-    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
+    matrix = mass_matrix(model, data)
     inertia = np.diag(matrix)[6:] - model.dof_armature[6:] + armature  # about each joint, of all that it moves
     height, holding, stiff = _standing(source, legs, data)
     started = [zero_pose(model, np.clip(share * angles, ranges[:, 0], ranges[:, 1])) for share in SPREAD]

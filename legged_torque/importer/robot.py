@@ -1,5 +1,6 @@
 """An imported robot: all that its MJCF and its settings need, and notes on what was changed."""
 
+import copy
 import keyword
 import re
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from legged_torque.envs.base.robot_checks import side_problem
 from legged_torque.importer.legs import (
     FOOT,
     TRUNK,
@@ -51,7 +53,7 @@ class Robot:
     torques: np.ndarray  # [N m]
     speed: float  # highest of the joints [rad/s]
     mirrored: list[list[str]]  # pairs of right and left legs
-    symmetric: bool  # whether every joint has a mirror image, and the nominal pose is its own
+    symmetric: bool  # whether the robot is its own mirror image, at least its joints and what they move
     stance: Stance
 
     def by_kind(self, values: np.ndarray) -> dict[str, float]:
@@ -81,6 +83,7 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     shapes = find_shapes(source)
     legs = find_legs(source, shapes)
     ranges, unlimited = source.model.jnt_range[1:].copy(), source.model.jnt_limited[1:] == 0
+    unlimited |= ~np.isfinite(ranges).all(axis=1)
     ranges[unlimited] = -UNLIMITED, UNLIMITED
     source.notes.on(source.which(unlimited), f"without a range, +-{UNLIMITED:.2f} rad given")
     torques = _torques(source, shapes, torque_limit)
@@ -99,6 +102,9 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
         image = Mirroring(order, mirror_signs(joints, joint_axes(source.model)[1:], order))
         pair = image.unlike(stance.angles, joints)
         asymmetries += [f"the nominal pose has {pair}"] if pair else []
+        sides = copy.copy(source.model)
+        sides.jnt_range[1:], sides.jnt_limited[1:], sides.dof_armature[6:] = ranges, 1, stance.armature
+        asymmetries += filter(None, [side_problem(sides, torques, image, joints)])
     source.notes += [f"training without mirror images: {reason}" for reason in asymmetries]
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]

@@ -82,7 +82,7 @@ def read_source(file: Path) -> Source:
                 raise UserError(f"{what}: it is a xacro; make a URDF of it: xacro {file} > robot.urdf")
             for part in root.iter():
                 part.tag = part.tag.rpartition("}")[2]  # which MuJoCo reads without a namespace
-            _prepare_urdf(root, what)
+            weightless = _prepare_urdf(root, what)
             is_urdf = root.tag == "robot"
             text = ET.tostring(root, encoding="unicode")
             spec = mujoco.MjSpec.from_string(text) if is_urdf else mujoco.MjSpec.from_file(str(file))
@@ -93,9 +93,10 @@ def read_source(file: Path) -> Source:
             negative = [body for body in spec.bodies if body.mass < 0.0]
             refuse([f"'{body.name}' must weigh 0 kg or more, not {body.mass:g}" for body in negative], what)
             notes = _prepare(spec, file, is_urdf)
+            notes.on(weightless, "without a mass in the file: they weigh what is fixed to them")
             model = _compile(spec, notes)
             speeds = [float(limit.get("velocity", 0)) for limit in root.findall("joint/limit")]  # of a URDF
-        except (ValueError, ET.ParseError, mujoco.FatalError) as error:
+        except (ValueError, LookupError, RecursionError, ET.ParseError, mujoco.FatalError) as error:
             raise UserError(f"{what}: {' '.join(str(error).split())}") from None
     hinge, free = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_FREE
     others = [model.joint(i).name for i in range(1, model.njnt) if model.jnt_type[i] != hinge]
@@ -126,8 +127,11 @@ def read_source(file: Path) -> Source:
     return Source(file, model, sites, poses, limits, [speed for speed in speeds if speed > 0], notes)
 
 
-def _prepare_urdf(root: ET.Element, what: str) -> None:
-    """Remove what MuJoCo need not read of a URDF, and give joints with one limit the other, 0."""
+def _prepare_urdf(root: ET.Element, what: str) -> list[str]:
+    """Remove what MuJoCo need not read of a URDF, and give joints with one limit the other, 0.
+
+    Returns the names of moving links without a mass of their own.
+    """
     for link in root.findall("link"):  # shapes follow from its collision geoms
         for part in link.findall("visual"):
             link.remove(part)
@@ -139,6 +143,15 @@ def _prepare_urdf(root: ET.Element, what: str) -> None:
             low, high = limit.attrib.setdefault("lower", "0"), limit.attrib.setdefault("upper", "0")
             if float(low) >= float(high):  # MuJoCo would take equal ones for none
                 raise UserError(f"{what}: '{joint.get('name')}' must be fixed or have lower < upper, not {low}, {high}")
+    joints = (joint for joint in root.findall("joint") if joint.get("type") != "fixed")
+    moving = {child.get("link") for joint in joints for child in joint.findall("child")}
+    masses = {link.get("name"): link.find("inertial/mass") for link in root.findall("link")}
+    return [str(link) for link, mass in masses.items() if link in moving and not _value(mass)]
+
+
+def _value(part: ET.Element | None) -> float:
+    """Return the number that an element has; 0 without one."""
+    return 0.0 if part is None else float(part.get("value", 0.0))
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:

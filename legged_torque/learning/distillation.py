@@ -285,6 +285,9 @@ class Teacher:
         for path in sorted(own.keys() | theirs.keys()):
             if path.startswith(tuple(SAME)) and own.get(path) != theirs.get(path):
                 raise UserError(f"the teacher '{name}' has {path}={theirs.get(path)}, its student {own.get(path)}")
+        given, needed = env.cfg.env.history_length, run.env_cfg.env.history_length
+        if given < needed:
+            raise UserError(f"env.history_length must be at least that of the teacher '{name}', {needed}, not {given}")
         self._env, self.cfg = env, run.env_cfg
         self._size = env.observations.policy_size * run.env_cfg.env.history_length
         run.train_cfg.algorithm.symmetry_cfg.use_data_augmentation = False  # images are of the student's observations

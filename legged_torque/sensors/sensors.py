@@ -35,6 +35,8 @@ class Sensors(dict[str, Sensor]):
         if others := [f"sensors.{name}" for name, value in sections.items() if not isinstance(value, SensorCfg)]:
             raise UserError(f"{', '.join(others)} must inherit SensorCfg, as all sections of sensors")
         super().__init__({name: section.build(state) for name, section in sections.items()})
+        if others := [f"sensors.{name}.build" for name, sensor in self.items() if not isinstance(sensor, Sensor)]:
+            raise UserError(f"{', '.join(others)} must return a Sensor")
         self.height_scan = HeightScan(cfg.terrain, state) if state.ground.map is not None else None
         if self.height_scan:
             if "height_scan" in self:

@@ -89,6 +89,7 @@ class Randomization:
         rows: list[kernels.RandomNumber] = []
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
+        owners: dict[int, str] = {}  # of the numbers, by address
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
             check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
@@ -96,6 +97,8 @@ class Randomization:
         listed |= {each.same_draw_as or each.name: each for each in parameters[::-1] if each.is_drawn}
         for parameter in parameters:
             field, of_draw = self._field(parameter, model_field), parameter.same_draw_as or parameter.name
+            if parameter.same_draw_as and "scale_per_joint" in parameter.draw:
+                raise UserError(f"random parameter '{of_draw}' takes no scale_per_joint: '{parameter.name}' follows it")
             start, is_listed = first_draw.setdefault(of_draw, num_draws), listed[of_draw] is parameter
             if is_listed:
                 self.sizes[parameter.name] = parameter.num_listed
@@ -106,6 +109,9 @@ class Randomization:
             table_rows = table(parameter, field, keep_probability)
             for i, (column, row) in enumerate(zip(parameter.columns, table_rows, strict=True)):
                 row.address = field[:, column].data_ptr()
+                if owners.setdefault(row.address, parameter.name) != parameter.name:
+                    both = f"'{owners[row.address]}' and '{parameter.name}'"
+                    raise UserError(f"random parameters {both} write the same number: leave one of them out")
                 row.stride = field.stride(0) * field.element_size()
                 row.draw = start + (0 if parameter.shared else i)
                 row.column_draw = -1 if column_draw is None else column_draw + i

@@ -5,7 +5,7 @@ import copy
 import functools
 import inspect
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import yaml
 
@@ -65,6 +65,14 @@ class Section:
                 value = copy.deepcopy(list(value) if isinstance(value, tuple) else value)  # YAML knows no tuples
             setattr(self, key, value)
 
+    if not TYPE_CHECKING:  # which would then take any name for a setting
+
+        def __getattr__(self, name: str) -> Any:
+            """Refuse legged_gym's settings with their successors; Python calls this for what does not exist."""
+            if not name.startswith("_") and (replaced := successor("settings", f"{type(self).__name__}.{name}")):
+                raise UserError(replaced)
+            raise AttributeError(f"'{type(self).__name__}' has no setting or section '{name}'")
+
     def check(self, path: str = "") -> None:
         """Raise a UserError that names all settings, here and below, that the class lacks or whose values are wrong.
 
@@ -78,7 +86,8 @@ class Section:
                     value.check(dotted)
                 else:
                     advice = advice if key in self._names else DECLARE
-                    check_value(checked_path(path, key, self._names), value, _type_of(self, key))
+                    plain = check_value(checked_path(path, key, self._names), value, _type_of(self, key))
+                    setattr(self, key, plain)  # numpy's numbers are floats to Python, but not to YAML
         refuse(problems, advice=advice)
 
 

@@ -160,6 +160,15 @@ def robot_notes(file: Path, trained: Path) -> Iterator[str]:
         yield f"asset.file has {masses[0]:.3f} kg, the robot of the training {masses[1]:.3f} kg"
 
 
+def mass_matrix(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Return the mass matrix of a state whose kinematics are known. Shape: (nv, nv)."""
+    mujoco.mj_crb(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+        mujoco.mj_mulM(model, data, row, unit)
+    return matrix
+
+
 def joint_limits(model: mujoco.MjModel) -> np.ndarray:
     """Return lowest and highest position of each joint, infinite without a range. Shape: (njnt, 2) [rad]."""
     return np.where(model.jnt_limited[:, np.newaxis] > 0, model.jnt_range, [-np.inf, np.inf])

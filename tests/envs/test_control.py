@@ -96,6 +96,8 @@ def test_record(make_task, tmp_path):
             imitated = np.exp(-10.0 * np.square(task.dof_pos.numpy() - reference).sum(axis=1))
             np.testing.assert_allclose(task._reward_imitation_angles()[kept], imitated[kept], rtol=1e-3, atol=1e-6)
             count = np.where(kept, count + 1, 0)
+    joint = next(name for name in task.dof_names if f"'{name}'" in error_of(lambda: task.mirror))
+    assert joint.startswith(("FR", "RR"))  # it has no mirror image, as this record has none
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from support.robot_files import changed as changed  # a fixture
 from support.robot_files import setting
@@ -104,6 +105,35 @@ def test_ranges_of_another_robot(make_task, name, limits, note):
     hard = get_cfgs("--ranges=hard")[0].parameter_ranges()["hard"]["domain_rand"]
     ranges = {f"domain_rand.{key}": value for key, value in hard.items()}
     assert make_task("a1_position", 1, **ON, **ranges).notes == []
+
+
+@pytest.mark.parametrize("operation", ["set", "add"])
+def test_what_goes_with_another_parameter(make_task, operation):
+    """A trunk's inertia stays in proportion to its mass, torque scales to action scales, however those are drawn."""
+    masses, scales = {"set": ([4.5, 5.0], [0.2, 0.3]), "add": ([-0.2, 0.3], [-0.05, 0.05])}[operation]
+    ranges = {"domain_rand.trunk_mass": {operation: masses}, "domain_rand.action_scale": {operation: scales}}
+    task = make_task("a1_multihead", 20, **ON, **ranges)
+    model, mass = task.asset.mj_model, task.sim.field("body_mass")[:, 1]
+    share = (mass / model.body_mass[1]).numpy()[:, None]
+    np.testing.assert_allclose(task.sim.field("body_inertia")[:, 1], share * model.body_inertia[1], rtol=1e-4)
+    torch.testing.assert_close(task.torque_scale / task.cfg.control.torque_scale, task.action_scale / 0.25)
+    assert mass.std() > 0.05 and task.action_scale.std() > 0.01
+
+
+@pytest.mark.parametrize("name", ["trunk_mass", "action_scale"])
+def test_no_factors_per_joint(make_task, name):
+    """Numbers that another one follows have no factors of their own, as it would have others."""
+    ranges = {f"domain_rand.{name}": {"scale_per_joint": [0.9, 1.1]}}
+    message = f"random parameter '{name}' takes no scale_per_joint"
+    assert error_of(make_task, "a1_torque", 1, **ON, **ranges).startswith(message)
+
+
+def test_hard_ranges_of_a_variant():
+    """They replace ranges of another operation that the variant has, as a value can only be set or changed."""
+    cfg = A1Cfg()
+    cfg.domain_rand.ground_friction = {"scale": [0.8, 1.2]}
+    hard = cfg.parameter_ranges()["hard"]["domain_rand"]["ground_friction"]
+    assert hard == {"set": [0.001, 2.0]}
 
 
 @pytest.mark.parametrize(("name", "limits", "message"), PUBLISHED["negative"])

@@ -221,6 +221,24 @@ def test_feet_between_axes(changed, make_task):
     assert "random parameter 'foot_pos' is not known" in error_of(lambda: make_task("a1_torque", 1, **settings).mirror)
 
 
+UNLIKE = {
+    "ranges of FR_thigh_joint and FL_thigh_joint": joint("FL_thigh_joint", range="-1.0472 3.0"),
+    "torque limits of RR_calf_joint and RL_calf_joint": setting(".//motor[@name='RL_calf']", forcerange="-20 20"),
+    "damping of FR_hip_joint and FL_hip_joint": joint("FR_hip_joint", damping="0.5"),
+    "dry friction of FR_hip_joint and FL_hip_joint": joint("FR_hip_joint", frictionloss="5"),
+    "springs of FR_hip_joint and FL_hip_joint": joint("FR_hip_joint", stiffness="9"),
+    "inertias of FR_thigh_joint and FL_thigh_joint": setting(".//body[@name='FL_calf']/inertial", mass="0.452"),
+    "inertias of RR_thigh_joint and RL_thigh_joint": setting(".//body[@name='RL_thigh']/inertial", pos="0.1 0 -0.03"),
+}
+
+
+@pytest.mark.parametrize("parts", UNLIKE)
+def test_sides_that_move_otherwise(changed, make_task, parts):
+    """Where motors, friction, masses or their places of one leg are others, there is no mirror image either."""
+    task = make_task("a1_torque", 1, **{"asset.file": changed(UNLIKE[parts])})
+    assert error_of(lambda: task.mirror).startswith(f"the {parts}: these are not mirror images of each other")
+
+
 def test_unlike_sides_are_no_mirror_images(changed, make_task):
     """A leg at another place, or with another axis, has no mirror image."""
     task = make_task("a1_torque", 1, **{"asset.file": changed(setting(".//body[@name='FL_calf']", pos="0 0 -0.25"))})

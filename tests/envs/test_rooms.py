@@ -1,5 +1,7 @@
 """Robots, terms, parameters and grounds of a user: refusals by name, and a ground that needs no change of tasks."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -85,13 +87,48 @@ def test_observation_terms_that_do_not_fit(term, message):
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"value": torch.ones(2, 1)}, "value must be a function, as lambda: ..., not tensor"),
+        ({"scale": math.nan}, "scale must be finite"),
+        ({"scale": ["a"]}, "scale must be a number, not ['a']"),
+        ({"noise": [0.1, 0.2]}, "noise must be a number, not [0.1, 0.2]"),
+        ({"noise": -0.1}, "noise must be at least 0, not -0.1"),
+    ],
+)
+def test_numbers_of_observation_terms(changes, message):
+    """Scales and noise that are none are refused by name; numbers of numpy and torch are numbers."""
+    settings = {"value": lambda: torch.ones(2, 1), "mirror": SCALAR}
+    assert message in error_of(lambda: ObservationTerm("mine", **settings | changes))
+    scales = [ObservationTerm("mine", **settings, scale=scale).scale for scale in (torch.tensor(2.0), np.ones(1))]
+    assert scales == [2.0, [1.0]]
+
+
+@pytest.mark.parametrize("hook", ["observation_terms", "action_terms"])
+def test_no_terms(hook):
+    """A policy that sees or does nothing is refused."""
+    cfg = A1Cfg()
+    cfg.env.num_envs = 2
+    assert f"{hook}() must return" in error_of(type("Robot", (LeggedRobot,), {hook: lambda self: []}), cfg)
+
+
+@pytest.mark.parametrize(
     ("make", "message"),
     [
         (
             lambda task: RandomParameter("mass", task.sim.field("body_mass"), [2], {}),
             "'mass' is the model's 'body_mass'",
         ),
-        (lambda task: RandomParameter("gain", task.p_gains, [0, 1], {}, mirror=SCALAR), "'gain' must have 2 numbers"),
+        (lambda task: RandomParameter("own", torch.ones(2, 2), [0, 1], {}, mirror=SCALAR), "'own' must have 2 numbers"),
+        (lambda task: RandomParameter("gain", task.p_gains, [0], {}), "'stiffness' and 'gain' write the same number"),
+        (
+            lambda task: RandomParameter("calf_mass", "body_mass", [4], {"add": [-0.5, 0.5]}),
+            "'calf_mass' can be -0.274 with the ranges given; it must be at least 0.01",
+        ),
+        (
+            lambda task: RandomParameter("calf_spin", "body_inertia", [12], {"scale": [0.0, 1.0]}),
+            "'calf_spin' can be 0 with the ranges given; it must be greater than 0",
+        ),
         (lambda task: RandomParameter("gravity", task.p_gains, [0], {}), "two random parameters are called 'gravity'"),
         (lambda task: RandomParameter("thigh_mass", "body_mass", [3, 6], {"scale": [0.5, 0.9]}), "'thigh_mass'"),
         (

@@ -109,6 +109,7 @@ UNLIKE = {
     "init_state.default_joint_angles.FL_hip_joint=0.5": (-0.1, 0.5),
     "control.stiffness={FR: 20, FL: 60, R: 20}": (20, 60),
     "control.damping={FR: 0.5, F: 1, R: 0.5}": (0.5, 1),
+    "motors.drive.stiffness={FR: 0, F: 30, R: 0}": (0, 30),
 }
 
 

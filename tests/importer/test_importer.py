@@ -119,6 +119,28 @@ def test_a_keyframe_of_two_sides(written, left, right, fits):
     )
 
 
+SIDES = {
+    "torque limits of LF_KFE and RF_KFE": ('effort="20" velocity="15" lower="-2.6"', 'effort="10" lower="-2.6"'),
+    "ranges of LF_HFE and RF_HFE": ('lower="-1.0" upper="3.0"', 'lower="-1.0" upper="1.5"'),
+    "inertias of LF_HFE and RF_HFE": ('<mass value="0.2"/>', '<mass value="2"/>'),
+}
+
+
+@pytest.mark.parametrize("parts", SIDES)
+def test_unlike_sides(written, parts):
+    """A leg that is weaker, bends less far or weighs more than its counterpart is noted, and trains without images."""
+    robot, _, _ = written(urdf().replace(*SIDES[parts], 1), "urdf")
+    (note,) = (note for note in robot.source.notes if "without mirror images" in note)
+    assert parts in note and not robot.symmetric
+
+
+def test_a_link_without_a_mass(written):
+    """A link that moves and has none in the file is named: its counterparts weigh more."""
+    robot, model, _ = written(urdf().replace('<mass value="0.2"/>', '<mass value="0"/>', 1), "urdf")
+    assert "without a mass in the file: they weigh what is fixed to them: LF_shank" in robot.source.notes
+    assert model.body("LF_shank").mass[0] == pytest.approx(0.05)  # its foot's
+
+
 def test_training(written):
     """An imported robot trains three iterations with random parameters; nothing is said of another robot's ranges."""
     _, _, cfg = written(urdf(), "urdf")

@@ -179,8 +179,9 @@ def test_a_delay_outside_the_chain(make_task):
     settings = {"motors.chain": ["ideal"], **delayed(0, 3, "physics_steps")}
     assert make_task("a1_torque", 1, **settings).notes == ["motors.delay has no effect: motors.chain lacks 'delay'"]
     assert make_task("a1_torque", 1, **{**settings, "motors.chain": ["delay", "ideal"]}).notes == []
-    limitless = make_task("a1_torque", 1, **{"motors.chain": ["delay"]})
-    assert limitless.notes[0].startswith("no link of motors.chain limits torques")
+    for chain in (["delay", "drive"], ["delay", "perturbation"], ["delay"]):
+        limitless = make_task("a1_torque", 1, **{"motors.chain": chain})
+        assert limitless.notes[0].startswith("no link of motors.chain limits torques")
     assert unknown_parts(limitless, {"actions": {"terms": []}}) == ["no link of motors.chain limits torques"]
 
 

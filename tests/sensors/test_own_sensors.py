@@ -208,6 +208,9 @@ def test_sections_that_are_no_sensors():
 
     message = error_of(TorqueRobot, Cfg())
     assert message == "sensors.forgotten must inherit SensorCfg, as all sections of sensors"
+    cfg = RayCfg()
+    cfg.env.num_envs, cfg.sensors.none = 2, type("NoneCfg", (SensorCfg,), {"build": lambda self, state: None})()
+    assert error_of(RayRobot, cfg) == "sensors.none.build must return a Sensor"
     assert error_of(lambda: make().sensors["gird"]).startswith("unknown sensor 'gird'; did you mean 'grid'?")
 
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -196,6 +197,22 @@ def test_misspelt_settings_of_objects_are_refused():
         "annotate",
     ):
         assert part in said
+
+
+def test_numbers_of_numpy():
+    """They are plain numbers once they are checked, which YAML can write."""
+    env_cfg, _ = task_registry.get_cfgs("a1_torque")
+    env_cfg.control.torque_scale, env_cfg.init_state.pos = np.float64(5.0), [*np.float64([0.0, 0.0, 0.4])]
+    env_cfg.check()
+    assert yaml.safe_load(yaml.safe_dump(to_dict(env_cfg)))["init_state"]["pos"] == [0.0, 0.0, 0.4]
+
+
+def test_reading_old_settings():
+    """They are answered with their successors, and what never was is no attribute."""
+    env_cfg, _ = task_registry.get_cfgs("a1_torque")
+    assert "'control.control_type' is now" in error_of(lambda: env_cfg.control.control_type)
+    assert "'rewards.tracking_sigma' is now" in error_of(lambda: env_cfg.rewards.tracking_sigma)
+    assert not hasattr(env_cfg.control, "stifness")
 
 
 class Port(Both):

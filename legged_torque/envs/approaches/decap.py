@@ -16,6 +16,7 @@ from legged_torque import resource_path
 from legged_torque.envs.approaches.decap_config import DecapCfg as DecapCfg
 from legged_torque.envs.base.actions import ActionTerm, of_joint
 from legged_torque.envs.base.legged_robot import LeggedRobot
+from legged_torque.envs.base.robot_checks import UNLIKE
 from legged_torque.motors.kernel import read
 from legged_torque.utils.errors import UserError, refuse, unknown_name
 
@@ -56,6 +57,10 @@ class DecapRobot(LeggedRobot):
         self._record = (
             torch.tensor(read_angles(file, self.dof_names), device=self.device) if file else self.reference[:1]
         )
+        joints = self.symmetry.joints
+        for row in self._record.cpu().numpy() if joints else ():
+            pair = joints.unlike(row, self.dof_names) if joints else ""
+            self.symmetry.refuse(f"a row of control.decap.record has {pair}: {UNLIKE}" if pair else "")
         self.bias = torch.ones(1, device=self.device)
         self.update_curriculum()
 

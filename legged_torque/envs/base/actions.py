@@ -86,6 +86,8 @@ class ControlLaw:
 
     def __init__(self, terms: Sequence[ActionTerm], num_dof: int) -> None:
         """Put terms together, each with one action per joint, in this order."""
+        if not terms:
+            raise UserError("action_terms() must return one term or more")
         self.terms, self.num_actions = list(terms), len(terms) * num_dof
         laws = [((term.law, term.reads), term.weight) for term in terms]
         whole = [(term.whole_law, term.reads) for term in terms if term.whole_law]

@@ -9,7 +9,13 @@ import numpy as np
 
 from legged_torque import resource_path
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.envs.base.robot_checks import floor_problems, foot_notes, mirror_problem, pose_problems
+from legged_torque.envs.base.robot_checks import (
+    floor_problems,
+    foot_notes,
+    mirror_problem,
+    pose_problems,
+    side_problem,
+)
 from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
@@ -58,8 +64,9 @@ class Asset:
         axes = self.dof_axes().tolist()
         symmetry = RobotSymmetry(mirrored_legs, self.dof_names, axes, self.foot_names, self.foot_of)
         if symmetry.joints and symmetry.foot_geoms:
-            problem = mirror_problem(self.mj_model, symmetry.joints, symmetry.foot_geoms, self.foot_names)
-            symmetry.refuse(problem)
+            model, joints = self.mj_model, symmetry.joints
+            problem = mirror_problem(model, joints, symmetry.foot_geoms, self.foot_names)
+            symmetry.refuse(problem or side_problem(model, model.actuator_forcerange[:, 1], joints, self.dof_names))
         return symmetry
 
 

@@ -21,7 +21,7 @@ from legged_torque.sim.engine import Engine
 from legged_torque.sim.graph import CudaGraph
 from legged_torque.sim.health import Health
 from legged_torque.terrain.terrain import Terrain
-from legged_torque.utils.buffers import InPlace, copy_state
+from legged_torque.utils.buffers import InPlace, check_tensor, copy_state
 from legged_torque.utils.config import flat, successor, to_dict
 from legged_torque.utils.errors import UserError
 
@@ -72,6 +72,8 @@ class BaseTask(InPlace, VecEnv):
         """Refuse legged_gym's attributes with their successors; Python calls this for what does not exist."""
         if replaced := successor("attributes", name):
             raise UserError(replaced)
+        if any(name in vars(base).get("__annotations__", ()) for base in type(self).__mro__):
+            raise UserError(f"'{name}' does not exist yet: tensors of your own belong behind super().__init__()")
         raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
     def compile(self) -> None:
@@ -141,7 +143,13 @@ class BaseTask(InPlace, VecEnv):
         tensors += flat(self.world_state_dict()).values()
         before = [tensor.clone() for tensor in tensors]
         with torch.random.fork_rng([self.device] if torch.device(self.device).type == "cuda" else []):
-            self._step()
+            self.update_curriculum()
+            for name, value in self.curriculum_values().items():
+                check_tensor(f"'{name}' of curriculum_values()", value, (), self.device)
+            if type(self).step is BaseTask.step:
+                self._step()
+            else:
+                self.step(torch.zeros_like(self._given_actions))
         for tensor, copy in zip(tensors, before, strict=True):
             if not torch.equal(tensor, copy):
                 tensor.copy_(copy)

@@ -319,7 +319,7 @@ class LeggedRobot(RewardTerms, Terminations, StateAccess, BaseTask):
         self.control = ControlParameters(self.cfg.control, self.dof_names, pose, self.num_envs, self.device)
         limits = self.asset.mj_model.actuator_forcerange.T
         self.torque_limits = torch.tensor(limits, dtype=torch.float32, device=self.device)
-        self.symmetry.refuse(control_problem(self.symmetry.joints, self.dof_names, self.control))
+        self.symmetry.refuse(control_problem(self.symmetry.joints, self.dof_names, self.control, self.cfg.motors))
         self._init_terminations(self.asset.terminating, self.device)
         self._init_reward_buffers(self.asset, self.device)
 

@@ -151,7 +151,7 @@ class LeggedRobotCfg(BaseConfig):
         contact_stiffness: Ranges = {"set": [900.0, 1100.0]}  # of MuJoCo's direct solref
         contact_damping: Ranges = {"set": [72.0, 88.0]}  # low where the stiffness is low
         gravity: Ranges = {"set": [9.51, 10.11]}  # [m/s^2]
-        motor_strength: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # times the torques
+        motor_strength: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # on what the control law wants
         joint_offset: Ranges = {"add": [-0.01, 0.01]}  # [rad] on the target angle, per joint
         action_scale: Ranges = {}  # [rad] per unit of a position action; torques in proportion
         stiffness: Ranges = {"scale": [0.9, 1.1], "scale_per_joint": [0.98, 1.02]}  # [N m/rad] Kp
@@ -304,9 +304,9 @@ class LeggedRobotCfg(BaseConfig):
 
 def _replaced(own: Any, hard: Any) -> Any:
     """Return a parameter's ranges with harder ones; numbers of a robot are not replaced by units of any robot."""
-    if not isinstance(own, dict):
+    if not isinstance(own, dict) or "set" in hard:
         return hard
-    return own if "set" in own and "set" not in hard else own | hard
+    return own if "set" in own else own | hard
 
 
 class LeggedRobotCfgPPO(TrainingCfg):

@@ -19,6 +19,7 @@ from legged_torque.sensors.height_scan import CLIP, OFFSET
 from legged_torque.sensors.sensors import Sensors
 from legged_torque.utils.buffers import check_tensor
 from legged_torque.utils.errors import UserError
+from legged_torque.utils.limits import NotNegative, check_value
 from legged_torque.utils.mirroring import AXIAL_VECTOR, PLANAR_VELOCITY, SCALAR, VECTOR, Mirroring
 
 
@@ -37,6 +38,15 @@ class ObservationTerm:
     meaning: str = ""  # what they are
     sensed: Callable[[], Tensor] | None = None  # of the policy in place of value, where that reaches it late
     group: str = ""  # a group of its own, which ``obs_groups`` can give to a network; empty: "policy" and "critic"
+
+    def __post_init__(self) -> None:
+        """Raise a UserError if value is no function, or scale or noise are no numbers."""
+        if not callable(self.value):
+            raise UserError(f"observation '{self.name}': value must be a function, as lambda: ..., not {self.value}")
+        scale: Any = self.scale
+        scale = scale.tolist() if hasattr(scale, "tolist") else list(scale) if isinstance(scale, Sequence) else scale
+        self.scale = check_value(f"observation '{self.name}': scale", scale, float | list[float])
+        self.noise = check_value(f"observation '{self.name}': noise", self.noise, NotNegative)
 
 
 _DESCRIPTIONS = {
@@ -138,6 +148,8 @@ class Observations:
         """Allocate the buffers. Observations are clipped to +-``clip``; ``add_noise`` is not for the critic."""
         self.terms = sorted((term for term in terms if not term.group), key=lambda term: term.privileged)
         self.sizes: dict[str, int] = {}
+        if not self.policy_terms():
+            raise UserError("observation_terms() must return a term for the policy, or more")
         for term in self.terms:
             _check(term, value := term.value(), num_envs, self.sizes)
             self.sizes[term.name] = value.shape[1]

@@ -20,7 +20,10 @@ from legged_torque.utils.options import CONTACT
 
 TRUNK = 1  # the trunk's body
 _ROUND = {int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)}  # types of feet that have a radius
-LEAST_MASS = 0.01  # [kg] of a trunk
+BOUNDS = {"body_mass": Limits(0.01), "body_inertia": Limits(above=0)} | dict.fromkeys(
+    ["geom_size", "geom_friction", "dof_damping", "dof_armature", "dof_frictionloss", "jnt_stiffness"], Limits(0)
+)
+"""What no draw of these fields of the model may leave."""
 
 
 def initial_state(
@@ -88,17 +91,17 @@ def robot_parameters(
 
     def of_joints(name: str, field: str, columns: Sequence[int], unit: str, add_unit: Any = 1.0) -> RandomParameter:
         """Return a parameter with a number per joint."""
-        more: dict[str, Any] = {"may_keep": True, "bounds": Limits(0), "mirror": joint_values}
+        more: dict[str, Any] = {"may_keep": True, "mirror": joint_values}
         return RandomParameter(name, field, columns, draws[name], unit, add_unit=add_unit, **more)
 
     mass, inertia, radii = draws["trunk_mass"], entries(3, [TRUNK]), [3 * foot for foot in feet]
-    trunk: dict[str, Any] = {"shared": True, "add_unit": inertia_per_mass}
+    trunk: dict[str, Any] = {"shared": True, "set_unit": inertia_per_mass, "add_unit": inertia_per_mass}
     com: dict[str, Any] = {"shared": True, "listed_by_column": True, "mirror": VECTOR}
     return [
-        RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg", bounds=Limits(LEAST_MASS)),
+        RandomParameter("trunk_mass", "body_mass", [TRUNK], mass, "kg"),
         RandomParameter("trunk_inertia", "body_inertia", inertia, mass, "kg m^2", same_draw_as="trunk_mass", **trunk),
         RandomParameter("trunk_com", "body_ipos", entries(3, [TRUNK]), draws["trunk_com"], "m", **com),
-        RandomParameter("foot_radius", "geom_size", radii, foot_radius, "m", shared=True, bounds=Limits(0)),
+        RandomParameter("foot_radius", "geom_size", radii, foot_radius, "m", shared=True),
         RandomParameter("foot_pos", "geom_pos", entries(3, feet), draws["foot_pos"], "m", mirror=foot_vectors),
         of_joints("dof_damping", "dof_damping", dofs, "N m s/rad", control.d_gains[0].tolist()),
         of_joints("dof_armature", "dof_armature", dofs, "kg m^2"),
@@ -127,7 +130,7 @@ def ground_parameters(draws: Mapping[str, Any], model: mujoco.MjModel) -> list[R
     geoms = [g for g in range(model.ngeom) if model.geom_contype[g] or model.geom_conaffinity[g]]
     friction = model.geom_friction[geoms]  # tangential, torsional, rolling
     kinds = list((friction / friction[:, :1]).ravel())
-    slides: dict[str, Any] = {"shared": True, "set_unit": kinds, "add_unit": kinds, "bounds": Limits(0)}
+    slides: dict[str, Any] = {"shared": True, "set_unit": kinds, "add_unit": kinds}
 
     def of_solref(part: int, **more: Any) -> RandomParameter:
         """Return a number of all solrefs; those of MuJoCo's direct format, which are set, are negative."""
@@ -171,6 +174,7 @@ def control_parameters(
             scale,
             "N m",
             same_draw_as="action_scale",
+            set_unit=control.torque_per_position,
             add_unit=control.torque_per_position,
         ),
         of_joints("stiffness", control.p_gains, "N m/rad"),
@@ -188,6 +192,8 @@ def with_settings(parameters: Sequence[RandomParameter], rand: Any, draws: Mappi
     for parameter in parameters:
         setting = parameter.name if parameter.name in draws else parameter.same_draw_as or parameter.name
         is_kept = setting in rand.keep_fixed or (rand._swept and setting not in rand._swept)
+        if isinstance(parameter.field, str) and parameter.bounds == Limits():
+            parameter = dataclasses.replace(parameter, bounds=BOUNDS.get(parameter.field, Limits()))
         kept.append(fixed(parameter) if is_kept else parameter)
     if rand.randomize_parameters:
         _refuse_mixed_solrefs([parameter for parameter in kept if parameter.name in CONTACT])

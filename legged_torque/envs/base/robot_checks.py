@@ -1,6 +1,7 @@
 """Checks that a robot's file and the settings of a task fit together."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -10,9 +11,13 @@ from legged_torque.envs.base.actions import ControlParameters
 from legged_torque.sim.model import FLOOR
 from legged_torque.sim.randomization import RandomParameter
 from legged_torque.utils.mirroring import MIRROR_TOLERANCE, Mirroring
-from legged_torque.utils.mjcf import body_chains, colliding_pairs, joint_limits, zero_pose
+from legged_torque.utils.mjcf import body_chains, colliding_pairs, joint_limits, mass_matrix, zero_pose
 
+UNLIKE = "these are not mirror images of each other"
+SIDES = 0.1  # by which sides may differ: ranges [rad], shares of torques and inertias
+FAST = 10.0  # velocity at which damping is compared with torques [rad/s]
 _POSES = 5  # random ones that are mirrored
+_ENDLESS = 1e3  # range of joints without one [rad]
 
 
 def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]:
@@ -59,16 +64,54 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
     return ""
 
 
-def control_problem(joints: Mirroring | None, dof_names: Sequence[str], control: ControlParameters) -> str:
+def side_problem(model: mujoco.MjModel, torques: np.ndarray, joints: Mirroring, names: Sequence[str]) -> str:
+    """Return which joint is not what the mirror image of its counterpart is; empty if all are.
+
+    Args:
+        model: The robot.
+        torques: Highest torques [N m]. Shape: (num_dof,).
+        joints: Mirroring of joint angles.
+        names: Those of the joints.
+    """
+    order, signs = list(joints.order), np.array(joints.signs)
+    limits = np.clip(joint_limits(model)[1:], -_ENDLESS, _ENDLESS)
+    turned = np.where(signs[:, np.newaxis] > 0.0, limits[order], -limits[order, ::-1])
+    parts: list[tuple[str, np.ndarray, np.ndarray, Any]] = [("ranges", limits, turned, 1.0)]
+    own = {"torque limits": torques, "damping": FAST * model.dof_damping[6:]}
+    own |= {"dry friction": model.dof_frictionloss[6:], "springs": model.jnt_stiffness[1:]}
+    for what, values in own.items():
+        parts.append((what, values, values[order], np.maximum(torques, torques[order])))
+    rng = np.random.default_rng(0)
+    for _ in range(_POSES):
+        angles = rng.uniform(*np.clip(limits.T, -1.0, 1.0))
+        inertia, image = (
+            mass_matrix(model, zero_pose(model, pose))[6:, 6:] for pose in (angles, angles[order] * signs)
+        )
+        about = np.sqrt(np.diag(inertia))
+        parts.append(
+            ("inertias", inertia, image[np.ix_(order, order)] * np.outer(signs, signs), np.outer(about, about))
+        )
+    for what, values, image, unit in parts:
+        misses = (np.abs(values - image) / unit).reshape(len(order), -1).max(axis=1)
+        if misses.max() > SIDES:
+            worst = sorted({int(misses.argmax()), order[int(misses.argmax())]})
+            return f"the {what} of {' and '.join(names[joint] for joint in worst)}: {UNLIKE}"
+    return ""
+
+
+def control_problem(joints: Mirroring | None, dof_names: Sequence[str], control: ControlParameters, motors: Any) -> str:
     """Return which nominal angle or gain does not fit its counterpart; empty if all do, or joints have no images."""
     if joints is None:
         return ""
-    checks = {"init_state.default_joint_angles": (joints, control.default_dof_pos)}
-    checks["control.stiffness"] = joints.unsigned(), control.p_gains[0]
-    checks["control.damping"] = joints.unsigned(), control.d_gains[0]
+    checks = {"init_state.default_joint_angles": (joints, control.default_dof_pos.cpu().numpy())}
+    checks["control.stiffness"] = joints.unsigned(), control.p_gains[0].cpu().numpy()
+    checks["control.damping"] = joints.unsigned(), control.d_gains[0].cpu().numpy()
+    for link, cfg in vars(motors).items():
+        for name, gains in cfg.constants(dof_names, link).items() if getattr(cfg, "_of_law", False) else ():
+            checks[f"motors.{link}.{name}"] = joints.unsigned(), np.array(gains)
     for setting, (image, values) in checks.items():
-        if pair := image.unlike(values.cpu().numpy(), dof_names):
-            return f"{setting} has {pair}, which are not mirror images of each other"
+        if pair := image.unlike(values, dof_names):
+            return f"{setting} has {pair}: {UNLIKE}"
     return ""
 
 

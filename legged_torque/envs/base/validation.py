@@ -4,13 +4,14 @@ from collections.abc import Iterator
 
 from legged_torque.envs.base.clocks import delays
 from legged_torque.envs.base.legged_robot_config import LeggedRobotCfg
-from legged_torque.motors.config import DelayCfg, MotorCfg
-from legged_torque.motors.model_config import EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg
+from legged_torque.motors.config import DelayCfg, MotorCfg, PerturbationCfg
+from legged_torque.motors.model_config import DriveCfg, EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg
 from legged_torque.terrain.layout import Layout
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.errors import UserError, check_names
 
-LIMITLESS = (DelayCfg, EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, QuantizeCfg)  # behind which torques may be any
+LIMITLESS = (DelayCfg, DriveCfg, EncoderCfg, FrictionCfg, LagCfg, NetworkCfg, PerturbationCfg, QuantizeCfg)
+"""Links behind which torques may be any."""
 
 
 def check_env_cfg(cfg: LeggedRobotCfg) -> None:
