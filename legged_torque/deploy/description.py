@@ -11,7 +11,7 @@ from legged_torque.motors.model_config import MODELS
 from legged_torque.utils.errors import UserError, check_names, refuse, require
 from legged_torque.utils.limits import LARGEST
 from legged_torque.utils.plain_yaml import dump_yaml, parse_yaml
-from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names
+from legged_torque.utils.policies import HUB, WANDB, policy_dir, policy_names, sha256
 
 DESCRIPTION_FILE = "policy.yaml"
 NETWORK_FILE = "policy.onnx"
@@ -86,6 +86,18 @@ def metadata(description: dict[str, Any]) -> dict[str, str]:
 def from_metadata(stored: dict[str, str], where: str) -> dict[str, Any]:
     """Return the sections of a description in a network's metadata, unchecked; ``where`` they are is for errors."""
     return {key: parse_yaml(text, f"{key} in {where}") for key, text in stored.items() if key in SCHEMA["properties"]}
+
+
+def write_description(folder: Path, description: dict[str, Any]) -> None:
+    """Store a description in its network, add that file's checksum, check it, and write it as ``policy.yaml``."""
+    import onnx
+
+    network = onnx.load(folder / NETWORK_FILE)
+    onnx.helper.set_model_props(network, metadata(description))
+    onnx.save(network, folder / NETWORK_FILE)
+    description["network"]["sha256"] = sha256(folder / NETWORK_FILE)
+    check(description)
+    (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
 
 
 def open_network(file: Path) -> tuple[Any, str]:

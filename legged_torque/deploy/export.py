@@ -15,15 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_torque import RESOURCES_DIR
-from legged_torque.deploy.description import (
-    DESCRIPTION_FILE,
-    FORMAT_VERSION,
-    NETWORK_FILE,
-    check,
-    columns,
-    metadata,
-    to_yaml,
-)
+from legged_torque.deploy.description import DESCRIPTION_FILE, FORMAT_VERSION, NETWORK_FILE, columns, write_description
 from legged_torque.deploy.policy import (
     OBSERVATIONS,
     Policy,
@@ -45,7 +37,6 @@ from legged_torque.terrain.layout import Layout
 from legged_torque.terrain.rough import RoughGround
 from legged_torque.utils.errors import UserError, refuse, require
 from legged_torque.utils.files import write_errors
-from legged_torque.utils.policies import sha256
 from legged_torque.utils.runs import package_versions
 
 TORCHSCRIPT_FILE = "policy.pt"
@@ -160,18 +151,6 @@ def export_note(task: LeggedRobot, model: MLPModel) -> str:
         terms = [term["name"] for term in description["observations"]["terms"] if "supplied" in term]
         problems = unknown_parts(task, description) + [f"the robot's side must supply '{name}'" for name in terms]
     return f"exports of this policy will not be complete: {'; '.join(problems)}" if problems else ""
-
-
-def write_description(folder: Path, description: dict[str, Any]) -> None:
-    """Store a description in its network, add that file's checksum, check it, and write it as ``policy.yaml``."""
-    import onnx
-
-    network = onnx.load(folder / NETWORK_FILE)
-    onnx.helper.set_model_props(network, metadata(description))
-    onnx.save(network, folder / NETWORK_FILE)
-    description["network"]["sha256"] = sha256(folder / NETWORK_FILE)
-    check(description)
-    (folder / DESCRIPTION_FILE).write_text(to_yaml(description), encoding="utf-8")
 
 
 def write_networks(model: MLPModel, obs: TensorDict, folder: Path, description: dict[str, Any]) -> float:

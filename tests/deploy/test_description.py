@@ -13,8 +13,7 @@ from support.exports import change
 from support.scripts import assert_told_in_one_line, run_here
 from support.settings import error_of
 
-from legged_torque.deploy.description import check
-from legged_torque.deploy.export import write_description
+from legged_torque.deploy.description import check, write_description
 from legged_torque.deploy.policy import Policy
 from legged_torque.deploy.simulation import evaluate
 from legged_torque.envs import LeggedRobotCfg
