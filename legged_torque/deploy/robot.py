@@ -11,19 +11,8 @@ import numpy as np
 
 from legged_torque.deploy import ground
 from legged_torque.deploy.policy import State
+from legged_torque.utils import mjcf
 from legged_torque.utils.errors import UserError, refuse, unknown_name, with_names
-from legged_torque.utils.mjcf import (
-    drawing_notes,
-    exclude_self_collisions,
-    joint_axes,
-    joint_limits,
-    loading,
-    motors_of,
-    self_pairs,
-    torque_per_control,
-    torque_range,
-    why_no_motor,
-)
 
 MASS_TOLERANCE = 1e-3  # share of the mass below which robots count as equally heavy
 PARALLEL = 0.999  # least cosine between axes that count as parallel
@@ -42,8 +31,8 @@ def joints_and_motors(model: mujoco.MjModel, order: Sequence[str]) -> tuple[list
     refuse([str(unknown_name("joint of the policy in the MJCF", name, names)) for name in missing])
     ids, motors, wrong = [names[name] for name in order], list[int](), defaultdict[str, list[str]](list)
     for name, joint in zip(order, ids, strict=True):
-        found = motors_of(model, joint)
-        reason = why_no_motor(model, found[0]) if len(found) == 1 else ""
+        found = mjcf.motors_of(model, joint)
+        reason = mjcf.why_no_motor(model, found[0]) if len(found) == 1 else ""
         if len(found) != 1:
             wrong[f"each joint of the policy must have one motor in the MJCF, not {len(found)}"].append(name)
         elif reason:
@@ -83,14 +72,14 @@ class MujocoRobot:
         """
         self.file, self._notes, self._description = Path(xml), list[str](), description
         collided = description["robot"]["self_collisions"]
-        with loading(self.file):
+        with mjcf.loading(self.file):
             spec = mujoco.MjSpec.from_file(str(self.file))
-            self._notes += drawing_notes(spec)
+            self._notes += mjcf.drawing_notes(spec)
             self.origins = ground.place_ground(spec, description, self._notes)
             self.model = spec.compile()
-            pairs = len(self_pairs(self.model))
+            pairs = len(mjcf.self_pairs(self.model))
             if pairs and not collided:
-                exclude_self_collisions(spec, self.model)
+                mjcf.exclude_self_collisions(spec, self.model)
                 self.model = spec.compile()
                 self._notes.append(f"{pairs} pairs of parts that the MJCF lets collide do not, as in training")
             if collided and not pairs:
@@ -244,11 +233,11 @@ class MujocoRobot:
         model, order = self.model, description["joint_order"]
         ids, motors = joints_and_motors(model, order)
         axes = [description["joints"][name]["axis"] for name in order]
-        cosines = (joint_axes(model)[ids] * axes).sum(axis=1)
+        cosines = (mjcf.joint_axes(model)[ids] * axes).sum(axis=1)
         self._qpos, self._dofs, self._motors = model.jnt_qposadr[ids], model.jnt_dofadr[ids], np.array(motors)
         self._signs = np.where(cosines < -PARALLEL, -1.0, 1.0)  # of the file's axes, as seen from the policy's
-        self._limits = np.sort(joint_limits(model)[ids].T * self._signs, axis=0)  # [rad] about the policy's axes
-        self._torque_per_control = self._signs * [torque_per_control(model, motor) for motor in motors]
+        self._limits = np.sort(mjcf.joint_limits(model)[ids].T * self._signs, axis=0)  # [rad] about the policy's axes
+        self._torque_per_control = self._signs * [mjcf.torque_per_control(model, motor) for motor in motors]
         self._cosines = cosines
 
     def _joint_notes(self) -> Iterator[str]:
@@ -270,14 +259,12 @@ class MujocoRobot:
             for field in ("damping", "armature", "frictionloss"):
                 own = float(getattr(self.model, f"dof_{field}")[self._dofs[i]])
                 if not np.isclose(own, trained[field], rtol=1e-4, atol=1e-9):
-                    note = f"{field} of joints: {own:g} here, {trained[field]:g} in the training"
-                    different[note].append(name)
-            weakest, strongest = sorted(self._signs[i] * limit for limit in torque_range(self.model, self._motors[i]))
+                    different[f"{field} of joints: {own:g} here, {trained[field]:g} in the training"].append(name)
+            own_limits = np.sort(self._signs[i] * np.array(mjcf.torque_range(self.model, self._motors[i])))
             limits = description["torque_limits"][name]
-            if not np.allclose((weakest, strongest), limits, rtol=1e-4):
-                here, there = f"{weakest:g} to {strongest:g} N m", f"{limits[0]:g} to {limits[1]:g} N m"
-                note = f"motor limits: the MJCF has {here}, policy.yaml {there}; the tighter ones act"
-                different[note].append(name)
+            if not np.allclose(own_limits, limits, rtol=1e-4):
+                here, there = ("{:g} to {:g} N m".format(*each) for each in (own_limits, limits))
+                different[f"motor limits: the MJCF has {here}, policy.yaml {there}; the tighter ones act"].append(name)
         for note, names in different.items():
             yield f"{note} ({', '.join(names) if len(names) < len(cosines) else 'all joints'})"
 
