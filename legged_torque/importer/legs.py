@@ -7,7 +7,7 @@ from itertools import takewhile
 import mujoco
 import numpy as np
 
-from legged_torque.importer.shapes import ROUND, Shape, box_around, fit_geom, fit_inertia
+from legged_torque.importer.shapes import ROUND, Shape, box_around, fit_geom, fit_inertia, lowest_point
 from legged_torque.importer.source import Source
 from legged_torque.utils.errors import UserError
 from legged_torque.utils.mjcf import body_chains, zero_pose
@@ -55,12 +55,6 @@ def free_joints(model: mujoco.MjModel, legs: list[Leg]) -> set[int]:
         pitch = joints[np.abs(data.xaxis[joints] @ pitch_axis(data.xaxis[joints])) > PARALLEL]
         free |= {*(pitch - 1).tolist(), *(joints[list(joints).index(pitch[-1]) :] - 1).tolist()}
     return free
-
-
-def lowest_point(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
-    """Return the center of a shape in the world, at the height of its lowest point [m]. Shape: (3,)."""
-    ends = shape.ends() @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
-    return np.append(ends.mean(axis=0)[:2], ends[:, 2].min() - shape.radius)
 
 
 def find_shapes(source: Source) -> dict[int, list[Shape]]:

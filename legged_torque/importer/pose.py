@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from mujoco.minimize import least_squares
 
-from legged_torque.importer.legs import PARALLEL, Leg, lowest_point, pitch_axis
-from legged_torque.importer.shapes import Shape
+from legged_torque.importer.legs import PARALLEL, Leg, pitch_axis
+from legged_torque.importer.shapes import Shape, lowest_point
 from legged_torque.importer.source import Source
 from legged_torque.utils.mjcf import mass_matrix, zero_pose
 

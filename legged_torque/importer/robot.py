@@ -11,18 +11,9 @@ import mujoco
 import numpy as np
 
 from legged_torque.envs.base.robot_checks import side_problem
-from legged_torque.importer.legs import (
-    FOOT,
-    TRUNK,
-    Leg,
-    find_legs,
-    find_shapes,
-    joint_names,
-    lowest_point,
-    mirrored_legs,
-)
+from legged_torque.importer.legs import FOOT, TRUNK, Leg, find_legs, find_shapes, joint_names, mirrored_legs
 from legged_torque.importer.pose import Stance, find_stance
-from legged_torque.importer.shapes import Shape
+from legged_torque.importer.shapes import Shape, lowest_point
 from legged_torque.importer.source import Source, read_source
 from legged_torque.utils.errors import UserError, collect_errors
 from legged_torque.utils.mirroring import Mirroring, counterparts, mirror_signs

@@ -81,6 +81,12 @@ def rotation(quat: np.ndarray) -> np.ndarray:
     return matrix.reshape(3, 3)
 
 
+def lowest_point(data: mujoco.MjData, body: int, shape: Shape) -> np.ndarray:
+    """Return the center of a shape in the world, at the height of its lowest point [m]. Shape: (3,)."""
+    ends = shape.ends() @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
+    return np.append(ends.mean(axis=0)[:2], ends[:, 2].min() - shape.radius)
+
+
 def fit_geom(model: mujoco.MjModel, geom: int) -> tuple[Shape, str]:
     """Return the plain shape of a geom, and the kind that it replaces ("" if the geom is plain).
 
