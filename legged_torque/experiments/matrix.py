@@ -13,18 +13,12 @@ from legged_torque.envs import task_registry
 from legged_torque.envs.base.distillation_config import DISTILLATION
 from legged_torque.envs.base.validation import check_env_cfg
 from legged_torque.terrain.selection import named_kinds, rising_levels
+from legged_torque.utils import runs
 from legged_torque.utils.config import flat, to_dict
 from legged_torque.utils.errors import UserError, check_names, refuse
 from legged_torque.utils.limits import Count, Worlds, check_value, types_of
 from legged_torque.utils.options import Options, draw_only, refuse_of_trainings, without_effect
 from legged_torque.utils.plain_yaml import parse_yaml
-from legged_torque.utils.runs import (
-    checkpoint_number,
-    evaluations_file,
-    load_config,
-    newest_checkpoint,
-    steps_per_iteration,
-)
 
 SETTINGS_FILE = "experiment.yaml"  # copy of the description, in the folder of the results
 CELL_SETTINGS: tuple[str, ...] = ("seed", "runner.experiment_name", "env.num_actions")
@@ -74,7 +68,7 @@ class Cell:
 
     def rows_file(self, run_dir: Path, environment: str) -> Path:
         """Return the file of a run's evaluations in an environment during training."""
-        return evaluations_file(run_dir, "" if environment == self.environment else environment)
+        return runs.evaluations_file(run_dir, "" if environment == self.environment else environment)
 
 
 @dataclass(frozen=True)
@@ -286,14 +280,14 @@ def cell_state(cell: Cell) -> CellState:
     newest = last_checkpoint(cell)
     if newest is None:
         return CellState(0, None, missing)
-    config, iterations = load_config(newest.parent), checkpoint_number(newest)
+    config, iterations = runs.load_config(newest.parent), runs.checkpoint_number(newest)
     total = config.get("max_iterations")
     if type(total) is not int:
         raise UserError(f"the settings of the run '{newest.parent}' lack max_iterations")
     if iterations >= total:  # evaluations during a complete training are results, too
-        runs = list(cell.folder.glob("*/"))
-        missing = [name for name in missing if not any(has_rows(cell.rows_file(run, name)) for run in runs)]
-    return CellState(iterations, total, missing, iterations * (steps_per_iteration(config) or 0))
+        folders = list(cell.folder.glob("*/"))
+        missing = [name for name in missing if not any(has_rows(cell.rows_file(run, name)) for run in folders)]
+    return CellState(iterations, total, missing, iterations * (runs.steps_per_iteration(config) or 0))
 
 
 def is_done(cell: Cell) -> bool:
@@ -306,8 +300,8 @@ def is_done(cell: Cell) -> bool:
 
 def last_checkpoint(cell: Cell) -> Path | None:
     """Return the file of a cell's last checkpoint that is not damaged, or None; clocks of machines may differ."""
-    runs = sorted(cell.folder.glob("*/"), reverse=True)
-    return max(filter(None, map(newest_checkpoint, runs)), key=checkpoint_number, default=None)
+    folders = sorted(cell.folder.glob("*/"), reverse=True)
+    return max(filter(None, map(runs.newest_checkpoint, folders)), key=runs.checkpoint_number, default=None)
 
 
 def has_rows(file: Path) -> bool:
