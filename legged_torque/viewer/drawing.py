@@ -26,9 +26,9 @@ DISTANCE, TARGET = 1.6, 0.25  # of a video's camera to its target, height of the
 SMOOTHING = 0.1  # share of a change of height that is followed per frame
 JUMP = 0.6  # change of height that is followed at once [m]
 ARROW_LENGTH = 0.5  # for 1 m/s [m]
-COMMAND_HEIGHT, VELOCITY_HEIGHT = 0.24, 0.18  # of the arrows above the trunk's origin, for the A1 [m]
+HEIGHTS = (0.24, 0.18)  # of the arrows of command and velocity above the trunk's origin, for the A1 [m]
 MIN_SPEED = 0.05  # of a velocity with an arrow [m/s]
-COMMAND_COLOR, VELOCITY_COLOR = (0.1, 0.8, 0.2, 0.9), (0.1, 0.4, 1.0, 0.9)
+ARROW_COLORS = ((0.1, 0.8, 0.2, 0.9), (0.1, 0.4, 1.0, 0.9))  # of the same
 ARROW_RADIUS = 0.012  # of an arrow's shaft [m]
 
 RESOLUTION, MAX_PIXELS = 32.0, 4096  # of the picture: pixels per metre, and limit along a side
@@ -91,10 +91,7 @@ class Drawing:
         They begin with v_x and v_y in the trunk's frame [m/s]; what follows is not drawn.
         """
         kind, rotation = mujoco.mjtGeom.mjGEOM_ARROW, self.data.xmat[self.trunk].reshape(3, 3)
-        for vector, color, height in (
-            (command, COMMAND_COLOR, COMMAND_HEIGHT),
-            (velocity, VELOCITY_COLOR, VELOCITY_HEIGHT),
-        ):
+        for vector, color, height in zip((command, velocity), ARROW_COLORS, HEIGHTS, strict=True):
             if np.hypot(*vector[:2]) < MIN_SPEED or scene.ngeom >= scene.maxgeom:
                 continue
             start = self.data.xpos[self.trunk] + [0.0, 0.0, self.size * height]

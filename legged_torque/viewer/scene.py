@@ -16,15 +16,7 @@ from viser.transforms import SE3, SO3
 
 from legged_torque.utils.heading import heading
 from legged_torque.utils.mjcf import DRAWN_GROUPS
-from legged_torque.viewer.drawing import (
-    ARROW_LENGTH,
-    COMMAND_HEIGHT,
-    MIN_SPEED,
-    VELOCITY_HEIGHT,
-    Drawing,
-    Ground,
-    smoothed,
-)
+from legged_torque.viewer.drawing import ARROW_LENGTH, HEIGHTS, MIN_SPEED, Drawing, Ground, smoothed
 from legged_torque.viewer.session import Session
 from legged_torque.viewer.snapshot import Snapshot
 
@@ -147,8 +139,8 @@ class Scene:
             self._scan.points = (snapshot.scan + SCAN_HEIGHT * UP).astype(np.float32)
             for label, trunk in zip(self._labels, trunks, strict=False):
                 label.position = trunk + LABEL_HEIGHT * self._size * UP
-            self._draw_arrow(self._command, own[0], snapshot.commands[world], COMMAND_HEIGHT)
-            self._draw_arrow(self._velocity, own[0], snapshot.velocities[world], VELOCITY_HEIGHT)
+            self._draw_arrow(self._command, own[0], snapshot.commands[world], HEIGHTS[0])
+            self._draw_arrow(self._velocity, own[0], snapshot.velocities[world], HEIGHTS[1])
         self._move_cameras()
         if "follow" in shown and len(second):
             self._frame(trunks - trunks.mean(axis=0) * [1.0, 1.0, 0.0])
