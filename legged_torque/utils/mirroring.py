@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from legged_torque.utils.errors import UserError
 
@@ -76,19 +77,14 @@ def counterparts(names: Sequence[str], mirrored_legs: Sequence[Sequence[str]]) -
     return tuple(result)
 
 
-def mirror_signs(
-    names: Sequence[str], axes: Sequence[Sequence[float]] | np.ndarray, order: Sequence[int]
-) -> tuple[float, ...]:
+def mirror_signs(names: Sequence[str], axes: ArrayLike, order: Sequence[int]) -> tuple[float, ...]:
     """Return whether mirrored angles have the other sign: a turn about (x, y, z) becomes one about (-x, y, -z).
 
     A UserError if the axes of two counterparts, in the trunk's frame where all angles are 0, do not allow that.
     """
-    signs = []
-    for name, axis, other in zip(names, axes, order, strict=True):
-        alike = sum(
-            sign * part * image for sign, part, image in zip(AXIAL_VECTOR.signs, axes[other], axis, strict=True)
-        )
-        if abs(alike) < 0.999:
+    axes = np.asarray(axes)
+    cosines = (axes[list(order)] * AXIAL_VECTOR.signs * axes).sum(axis=1)
+    for name, cosine, other in zip(names, cosines, order, strict=True):
+        if abs(cosine) < 0.999:
             raise UserError(f"the axes of '{name}' and '{names[other]}' are not mirror images of each other")
-        signs.append(1.0 if alike > 0.0 else -1.0)
-    return tuple(signs)
+    return tuple(np.sign(cosines).tolist())
