@@ -173,7 +173,7 @@ class Session:
             self.snapshot = self.task.snapshot(self.sim_time, self.world)
 
     def hold(self, command: Command | None) -> None:
-        """Give all worlds a command, or those of the training, from the next step on."""
+        """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds from the next step on; None: as in training."""
         self.command = command
         self.task.command_generator.hold(command or self.task.cfg.commands.fixed)
         self.task.command_generator.update()
@@ -189,17 +189,13 @@ class Session:
 
     # ---- requests ----------------------------------------------------------------------------------------------------
 
-    @request
-    def set_command(self, command: Command | None) -> None:
-        """Command v_x, v_y [m/s] and a yaw rate [rad/s] in all worlds; None: those of the training."""
-        self.hold(command)
+    set_command = request(hold)
 
     @request
     def push(self, angle: float, speed: float) -> None:
         """Add a horizontal velocity [m/s] to every trunk, in a direction from its heading to its left [rad]."""
         push = self.task.base_pos.new_tensor([speed * math.cos(angle), speed * math.sin(angle), 0.0])
-        push = push.expand(self.task.num_envs, 3)
-        self.task.sim.qvel[:, :3] += quat_rotate_yaw(self.task.base_quat, push)
+        self.task.sim.qvel[:, :3] += quat_rotate_yaw(self.task.base_quat, push.expand(self.task.num_envs, 3))
         if self.companion:
             self.companion.push(angle, speed)
         self.message = Message(f"pushed with {speed:.1f} m/s")

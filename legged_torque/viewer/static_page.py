@@ -124,8 +124,7 @@ def write_robot(folder: Path, robot: MujocoRobot) -> list[str]:
 
 def library(package: str, checksum: str) -> bytes:
     """Return the archive of a package from the user's cache, else from the registry; a UserError if neither has it."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "legged_torque"
-    file = cache / Path(package).name
+    file = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "legged_torque", Path(package).name)
     content = file.read_bytes() if file.is_file() else b""
     if not _is_genuine(content, checksum):
         try:

@@ -187,8 +187,7 @@ class Page:
             if session.companion:
                 self._add_checkpoint("companion", session.companion)
             hint = "random parameters, pushes and noise; rebuilds the worlds"
-            presets = (AS_LOADED, *session.task.cfg.perturbations())
-            perturbation = gui.add_dropdown("perturbation", presets, hint=hint)
+            perturbation = gui.add_dropdown("perturbation", (AS_LOADED, *session.task.cfg.perturbations()), hint=hint)
             self._bind(perturbation, lambda: session.perturbation, session.set_perturbation)
         if session.mixing:
             with gui.add_folder("Mixing weights"):
@@ -295,8 +294,7 @@ class Page:
     def _add_tile(self, ground: Ground) -> None:
         """Add the tile of the followed robot."""
         gui, session, kinds, last = self._gui, self._session, ground.layout.kinds(), ground.layout.num_rows - 1
-        names = tuple(dict.fromkeys(kinds))
-        kind = gui.add_dropdown("kind", names, hint="moves the followed robot onto such a tile")
+        kind = gui.add_dropdown("kind", tuple(dict.fromkeys(kinds)), hint="moves the followed robot onto such a tile")
         level = gui.add_slider("level", 0, max(last, 1), 1, 0, hint="the first is the easiest", disabled=last == 0)
 
         def tile() -> tuple[int, int]:
