@@ -65,9 +65,8 @@ class Chirp(Policy):
         time, place = self._tick * self._period, np.arange(len(self.joint_order))
         self._tick += 1
         first = SWEEPS[0] * self._seconds
-        time, length, signs = (
-            (time, first, 1.0) if time < first else (time - first, self._seconds - first, 1.0 - 2.0 * (place % 2))
-        )
+        second = (time - first, self._seconds - first, 1.0 - 2.0 * (place % 2))
+        time, length, signs = (time, first, 1.0) if time < first else second
         self.has_ended = time >= length
         start, rise = FREQUENCIES[0], (FREQUENCIES[1] - FREQUENCIES[0]) / length
         phase, speed = 2.0 * np.pi * (start + 0.5 * rise * time) * time, 2.0 * np.pi * (start + rise * time)

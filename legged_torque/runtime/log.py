@@ -118,8 +118,7 @@ class RecordedLog:
         """Open a log; a UserError if it is none."""
         try:
             self._file, self._content = file, file.read_bytes()
-            parts = self._read(NonSeekingReader.iter_metadata)
-            about = next(part.metadata for part in parts if part.name == ROBOT)
+            about = next(part.metadata for part in self._read(NonSeekingReader.iter_metadata) if part.name == ROBOT)
             self.joint_order: list[str] = orjson.loads(about["joint_order"])
             self.sha256, self.task, self.period = about["sha256"], about["task"], float(about["period"])
             self.keeps_time = about.get("keeps_time") != "False"

@@ -49,8 +49,7 @@ class Operator(contextlib.AbstractContextManager["Operator"]):
     def __init__(self, controller: Controller) -> None:
         """Take the controller that obeys."""
         self._controller = controller
-        ranges = controller.policy.description["commands"]
-        low, high = np.array([ranges[name] for name in NAMES], float).T
+        low, high = np.array([controller.policy.description["commands"][name] for name in NAMES], float).T
         self._low, self._high = np.minimum(low, 0.0), np.maximum(high, 0.0)  # any robot may be told to stand
 
     def __exit__(self, *exception: object) -> None:

@@ -105,9 +105,8 @@ def _type(name: str, **members: Any) -> Any:
 
 
 # Octets are ``byte``: with uint8, types have other hashes, at which Unitree's version of Cyclone DDS crashes.
-MotorCmd_ = _type(
-    "MotorCmd_", mode=byte, q=float32, dq=float32, tau=float32, kp=float32, kd=float32, reserve=(uint32, 3)
-)
+_TARGETS = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), float32)
+MotorCmd_ = _type("MotorCmd_", mode=byte, **_TARGETS, reserve=(uint32, 3))
 BmsCmd_ = _type("BmsCmd_", off=byte, reserve=(byte, 3))
 _TRUNK = {"quaternion": (float32, 4), "gyroscope": (float32, 3), "accelerometer": (float32, 3), "rpy": (float32, 3)}
 IMUState_ = _type("IMUState_", **_TRUNK, temperature=byte)
