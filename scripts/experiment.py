@@ -28,8 +28,7 @@ def main() -> None:
     parser = cli.Parser(__doc__)
     parser.add_argument("file", type=Path, help="description of the matrix, see experiments/")
     parser.add_argument("--out", type=Path, help="folder of the results; default: logs/experiments/<name of the file>")
-    hint = "auto, cpu or cuda:N; auto uses all GPUs, or else the CPU"
-    parser.add_argument("--device", default="auto", help=hint)
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda:N; auto uses all GPUs, or else the CPU")
     hint = f"runs at a time on each device; default: {GPU_JOBS} on a GPU, {MPS_JOBS} with --mps, {CPU_JOBS} on the CPU"
     parser.add_argument("--jobs", type=int, help=hint)
     hint = "let runs on a GPU compute at once instead of in turns, by NVIDIA's Multi-Process Service"

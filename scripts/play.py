@@ -91,8 +91,7 @@ def parse_args() -> argparse.Namespace:
     parser = cli.Parser(__doc__)
     cli.add_task_args(parser)
     parser.set_defaults(seed=1)
-    hint = f"control steps, of most tasks 50 a second; default: {STEPS}"
-    parser.add_argument("--steps", type=int, help=hint)
+    parser.add_argument("--steps", type=int, help=f"control steps, of most tasks 50 a second; default: {STEPS}")
     hint = "who acts: the run's policy, or zero or random actions (from -1 to 1) without a run; default: %(default)s"
     parser.add_argument("--agent", choices=("policy", *AGENTS), default="policy", help=hint)
     cli.add_command_arg(parser)
@@ -168,10 +167,9 @@ def load_compared(args: argparse.Namespace, run: LoadedRun) -> LoadedRun:
     options = dataclasses.replace(cli.options_of(args), task="", num_envs=1, load_run=args.compare)
     options.policy = options.checkpoint = options.experiment_name = None
     compared = task_registry.load_run(options)
-    if compared.env_cfg.asset.file != run.env_cfg.asset.file:
-        raise UserError(
-            f"--compare needs runs of one robot, not {run.env_cfg.asset.file} and {compared.env_cfg.asset.file}"
-        )
+    robots = [cfg.asset.file for cfg in (run.env_cfg, compared.env_cfg)]
+    if robots[0] != robots[1]:
+        raise UserError("--compare needs runs of one robot, not {} and {}".format(*robots))
     rates = [1.0 / (cfg.sim.dt * cfg.control.decimation) for cfg in (run.env_cfg, compared.env_cfg)]
     if not math.isclose(*rates):
         raise UserError("--compare needs runs of one rate, not {:g} and {:g} Hz; see --policy_hz".format(*rates))

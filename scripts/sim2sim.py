@@ -36,8 +36,7 @@ def parse_args() -> argparse.Namespace:
     cli.add_command_arg(parser)
     hint = "largest velocity of a push per axis [m/s]; default: none"
     parser.add_argument("--push_velocity", type=float, default=0.0, help=hint)
-    hint = "probability of a push per control step; default: 0.002"
-    parser.add_argument("--push_probability", type=float, help=hint)
+    parser.add_argument("--push_probability", type=float, help="probability of a push per control step; default: 0.002")
     parser.add_argument("--seed", type=int, default=1, help="random seed; default: %(default)s")
     hint = "kinds of rough ground, or all; each robot starts on one of their tiles; default: the ground of training"
     parser.add_argument("--terrain", nargs="+", metavar="KIND", help=hint)
