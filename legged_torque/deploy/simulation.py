@@ -69,9 +69,8 @@ class Simulation:
         self._actions, self._measurements = (Latency(description, name) for name in ("actions", "measurements"))
         self._push_set_factor, self.notes = pushes.get("set_factor", 1.0), list[str]()
         if push_probability and not pushes:
-            self.notes.append(
-                "pushes: policy.yaml does not name pushes.set_factor, so 1.0 is taken; trainings have 1.1 by default"
-            )
+            lacks = "policy.yaml does not name pushes.set_factor"
+            self.notes.append(f"pushes: {lacks}, so 1.0 is taken; trainings have 1.1 by default")
         if others := description["episode"].get("not_simulated"):
             self.notes.append(f"episodes of the training are different, by {', '.join(others)}")
         losses = description.get("copper_loss", {})
@@ -112,8 +111,7 @@ class Simulation:
         policy, robot = self.policy, self.robot
         is_late = self._measurements.is_needed
         state = dataclasses.replace(self._measurements.received(self._now)) if is_late else self._measured()
-        places = policy.scan_places(robot.position, robot.quat)
-        self._heights.append(robot.position[2] - robot.ground_heights(places))
+        self._heights.append(robot.position[2] - robot.ground_heights(policy.scan_places(robot.position, robot.quat)))
         state.heights = self._heights[0]  # the oldest, of this episode
         self._actions.send(self._now, policy.act(policy.observation(state, self.command)))
         self._motors.begin()

@@ -131,8 +131,7 @@ def _penalized(robot: Robot) -> list[str]:
         leg = next((leg.name for leg in robot.legs if name.startswith(leg.name + "_")), "")
         part = name.removeprefix(leg).strip("_")
         if not any(known in name for known in parts):
-            matches_spared = any(part in other for other in spared)
-            parts.append(name if matches_spared else part)
+            parts.append(name if any(part in other for other in spared) else part)
     return parts
 
 

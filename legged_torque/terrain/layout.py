@@ -63,10 +63,8 @@ class Layout:
         columns = self.kinds()
         for name, share in self.terrain_proportions.items():
             if share and name not in columns:
-                raise UserError(
-                    f"terrain.terrain_proportions.{name} of {share:g} is too small for a column: "
-                    f"terrain.num_cols is {self.num_cols}"
-                )
+                column = f"a column: terrain.num_cols is {self.num_cols}"
+                raise UserError(f"terrain.terrain_proportions.{name} of {share:g} is too small for {column}")
 
     def kinds(self) -> list[str]:
         """Return the kind of each column: as many of each as its share says, in the order of the shares."""
