@@ -177,9 +177,7 @@ def draw_panel(axis: Axes, panel: Panel) -> None:
     if kept.any():
         axis.text(0.5, 0.88, f"{kept.mean():.0%} keep their own", **place)
     limits = (panel.expected.min(), panel.expected.max())
-    for values, how in (
-        (panel.values[~kept], {"fill": True, "color": COLORS[panel.group]}),
-        (panel.expected, {"color": "k"}),
-    ):
+    looks: list[dict[str, Any]] = [{"fill": True, "color": COLORS[panel.group]}, {"color": "k"}]
+    for values, how in zip((panel.values[~kept], panel.expected), looks, strict=True):
         counts, edges = np.histogram(values, BINS, limits)
         axis.stairs(counts / len(values), edges, **how)

@@ -18,13 +18,7 @@ from torch import Tensor
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.learning.random_state import own_random_numbers, seeded_state
 from legged_torque.paper.gravity.dynamics import RobotDynamics
-from legged_torque.paper.gravity.standing import (
-    Act,
-    check_torques,
-    measure_standing,
-    place_on_ground,
-    use_standing_trials,
-)
+from legged_torque.paper.gravity.standing import Act, measure_standing, place_on_ground, use_standing_trials
 from legged_torque.paper.gravity.threads import single_threaded
 from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.utils.config import to_dict
@@ -100,6 +94,15 @@ def check_settings(settings: Any) -> None:
         raise UserError(f"pretraining.num_rounds is {settings.num_rounds}, more than there are configurations")
     if not 0.0 < settings.held_out < 1.0:
         raise UserError(f"pretraining.held_out must be between 0 and 1, not {settings.held_out:g}")
+
+
+def check_torques(task: Any) -> None:
+    """Raise a UserError if a task's actions are not torques, or ``actions_for`` does not lead to the given ones."""
+    if not isinstance(task, TorqueRobot):
+        raise UserError(f"the actions of {type(task).__name__} are not torques, as those of TorqueRobot are")
+    wanted = torch.linspace(-5.0, 5.0, task.num_dof, device=task.device).expand_as(task.dof_pos)
+    if not torch.allclose(task._compute_torques(task.actions_for(wanted)), wanted, atol=1e-3):
+        raise UserError(f"{type(task).__name__} cannot give the torques that its actions_for is asked for")
 
 
 def learn_to_stand(
@@ -265,9 +268,8 @@ def make_controller(task: TorqueRobot, settings: WholeBodySettings | None = None
     """
     points, feet = len(task.foot_names), len(task.foot_geoms)
     if points != feet:
-        raise UserError(
-            f"gravity pre-training needs a point per foot; '{task.cfg.asset.file}' has {points} for {feet} feet"
-        )
+        own = f"'{task.cfg.asset.file}' has {points} for {feet} feet"
+        raise UserError(f"gravity pre-training needs a point per foot; {own}")
     dynamics = RobotDynamics(task.sim.mj_model, task.num_envs, task.device, task.foot_names)
     settings, model = settings or WholeBodySettings(), task.sim.mj_model
     weight = float(model.body_mass.sum()) * abs(float(model.opt.gravity[2]))

@@ -84,15 +84,6 @@ def is_standing(task: LeggedRobot) -> Tensor:
     return stands(task.base_height, task.cfg.rewards.base_height_target, tilt) & only_feet & slow
 
 
-def check_torques(task: LeggedRobot) -> None:
-    """Raise a UserError if a task's actions are not torques, or ``actions_for`` does not lead to the given ones."""
-    if not isinstance(task, TorqueRobot):
-        raise UserError(f"the actions of {type(task).__name__} are not torques, as those of TorqueRobot are")
-    wanted = torch.linspace(-5.0, 5.0, task.num_dof, device=task.device).expand_as(task.dof_pos)
-    if not torch.allclose(task._compute_torques(task.actions_for(wanted)), wanted, atol=1e-3):
-        raise UserError(f"{type(task).__name__} cannot give the torques that its actions_for is asked for")
-
-
 def measure_standing(task: TorqueRobot, act: Act, duration: float) -> StandingResult:
     """Let a controller or policy act from the present state on, and count the worlds that stand at the end.
 
@@ -122,11 +113,9 @@ class _LowestPoints:
     def __init__(self, task: LeggedRobot, dynamics: RobotDynamics) -> None:
         """Describe every geom as a rounded box: half sizes along its own axes, and a radius."""
         model = dynamics.mj_model
-        names = [model.geom(i).name for i in range(model.ngeom)]
-        feet = [names.index(name) for name in task.foot_names]
+        feet = [model.geom(name).id for name in task.foot_names]
         others = [i for i in range(model.ngeom) if model.geom_bodyid[i] > 0 and i not in feet]
-        shapes = [_rounded_box(model, i) for i in feet + others]
-        half_sizes, radii = zip(*shapes, strict=True)
+        half_sizes, radii = zip(*(_rounded_box(model, i) for i in feet + others), strict=True)
         self._half_sizes, self._radii = (torch.tensor(part, device=task.device) for part in (half_sizes, radii))
         self._geoms = torch.tensor(feet + others, device=task.device)
         self._sizes = [len(feet), len(others)]

@@ -245,8 +245,6 @@ def read_sweep(sweep: dict[str, Any]) -> pd.DataFrame:
     parts, is_delay = sweep["parts"], sweep["parameter"].endswith("_delay")
     at = [part["from"] if is_delay else (part["from"] + part["to"]) / 2.0 for part in parts]
     values = [part["fell"] if "fell" in part else part["metrics"]["track_percentage"] for part in parts]
-    errors = [value.get("standard_error") for value in values]
-    table = pd.DataFrame(
-        {"at": at, "value": [value["mean"] for value in values], "standard_error": errors}, dtype=float
-    )
+    means, errors = [value["mean"] for value in values], [value.get("standard_error") for value in values]
+    table = pd.DataFrame({"at": at, "value": means, "standard_error": errors}, dtype=float)
     return table.assign(unit=sweep["unit"], is_push="fell" in parts[0])

@@ -122,9 +122,7 @@ def missing_lines(experiment: Experiment, from_step: float) -> list[str]:
         lines += [f"{where}, seed {seed}: {text}." for seed, text in problems.items() if text]
         configs = [without_machine(config) for run in runs for config in run.configs]
         settings = [flat(config["env"]) | flat(config["train"]) for config in configs]
-        settings = [
-            {path: each[path] for path in each if all(path in other for other in settings)} for each in settings
-        ]
+        settings = [{path: each[path] for path in each if all(path in one for one in settings)} for each in settings]
         if changes := sorted({change for each in settings for change in differing(each, settings)}):
             lines.append(f"{where}: its trainings have different settings: {', '.join(changes)}.")
     if experiment.unplanned:

@@ -12,8 +12,7 @@ from support.settings import error_of, get_cfgs, torques_in_torch
 from legged_torque.envs import A1TorqueCfg
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.paper.gravity import pretraining as gravity_pretraining
-from legged_torque.paper.gravity.pretraining import pretrain
-from legged_torque.paper.gravity.standing import check_torques
+from legged_torque.paper.gravity.pretraining import check_torques, pretrain
 
 CURRICULUM, GRAVITY_CURRICULUM = "a1_torque_curriculum_multihead", "a1_torque_gravity_curriculum"
 GRAVITY, HIGH, TWO_RATES = "a1_torque_gravity_multihead", "a1_torque_curriculum_high", "a1_multihead_two_rates"
