@@ -1,7 +1,8 @@
 """Inertia, bias forces and Jacobians of many states of one robot, from MuJoCo Warp."""
 
+import contextlib
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import mujoco
 import mujoco_warp as mjw
@@ -128,6 +129,20 @@ class RobotDynamics:
     def _body_ids(self, body: int) -> wp.array:
         """Return one body's number for every state."""
         return wp.full(self.num_states, int(body), dtype=int, device=self.device)
+
+
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let torch use one CPU thread inside; as a decorator, in a function.
+
+    Factorizing many small matrices took 30 times as long with two threads as with one, on two cores with other work.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _check_model(model: mujoco.MjModel, contact_geoms: Sequence[str], names: list[str]) -> None:

@@ -17,9 +17,8 @@ from torch import Tensor
 
 from legged_torque.envs.approaches.torque import TorqueRobot
 from legged_torque.learning.random_state import own_random_numbers, seeded_state
-from legged_torque.paper.gravity.dynamics import RobotDynamics
+from legged_torque.paper.gravity.dynamics import RobotDynamics, single_threaded
 from legged_torque.paper.gravity.standing import Act, measure_standing, place_on_ground, use_standing_trials
-from legged_torque.paper.gravity.threads import single_threaded
 from legged_torque.paper.gravity.whole_body import WholeBodyController, WholeBodySettings, WholeBodyTorques
 from legged_torque.utils.config import to_dict
 from legged_torque.utils.devices import device_name

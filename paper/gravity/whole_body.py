@@ -8,8 +8,7 @@ from torch import Tensor
 
 from legged_torque.paper.gravity import operational_space as osc
 from legged_torque.paper.gravity.contact_forces import ForceDistribution, ForceLimits
-from legged_torque.paper.gravity.dynamics import TRUNK_DOFS, RobotDynamics
-from legged_torque.paper.gravity.threads import single_threaded
+from legged_torque.paper.gravity.dynamics import TRUNK_DOFS, RobotDynamics, single_threaded
 from legged_torque.utils.errors import UserError
 
 

@@ -120,9 +120,7 @@ def draw_sweep(tasks: list[str], sweep: Sweep) -> Figure:
 
 def findings(tasks: list[str], sweep: Sweep) -> str:
     """Return in words which tasks a sweep separates from the baseline and where most, which not, what is not tested."""
-    apart: list[str] = []
-    same: list[str] = []
-    untested: list[str] = []
+    apart, same, untested = list[str](), list[str](), list[str]()
     for task in (task for task in tasks if task != baseline_of(tasks) and task in set(sweep.values["task"])):
         cells = sweep.compared[sweep.compared.index.get_level_values("task") == task].droplevel("task")
         significant = cells[cells["is_significant"]]
