@@ -13,6 +13,7 @@ from legged_torque.utils.errors import UserError, check_names
 
 MAX_SAMPLES = 2**27
 """Of a map, which are half a gigabyte."""
+TOO_LARGE = "the map of terrain.num_rows x terrain.num_cols tiles {}: raise terrain.horizontal_scale or make it smaller"
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,7 @@ class Layout:
                 raise UserError(f"terrain.{name} must be {multiple}, not {getattr(self, name)}")
         samples = math.prod(self.shape)
         if samples > MAX_SAMPLES:
-            raise UserError(
-                f"the map of terrain.num_rows x terrain.num_cols tiles has {samples} samples, more than {MAX_SAMPLES}: "
-                "raise terrain.horizontal_scale, or make the map smaller"
-            )
+            raise UserError(TOO_LARGE.format(f"has {samples} samples, more than {MAX_SAMPLES}"))
         if len(self.difficulties) not in (0, self.num_rows):
             given = f"not {len(self.difficulties)}: terrain.num_rows is {self.num_rows}"
             raise UserError(f"terrain.difficulties must be empty or one number for each row, {given}")

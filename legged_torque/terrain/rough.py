@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from legged_torque.terrain.height_map import HeightMap
-from legged_torque.terrain.layout import Layout
+from legged_torque.terrain.layout import TOO_LARGE, Layout
 from legged_torque.terrain.terrain import Terrain
 from legged_torque.utils.errors import UserError, check_names
 
@@ -35,10 +35,8 @@ class RoughGround(Terrain):
         if torch.device(device).type == "cuda":
             needed, (free, _) = COPIES * BYTES * math.prod(layout.shape), torch.cuda.mem_get_info(device)
             if needed > free:
-                raise UserError(
-                    f"the map of terrain.num_rows x terrain.num_cols tiles needs {needed / 2**20:.0f} MiB, and "
-                    f"{device} has {free / 2**20:.0f} left: raise terrain.horizontal_scale, or make the map smaller"
-                )
+                left = f"{device} has {free / 2**20:.0f} left"
+                raise UserError(TOO_LARGE.format(f"needs {needed / 2**20:.0f} MiB, and {left}"))
         heights = layout.heights()
         self.map: HeightMap = HeightMap(heights, layout.horizontal_scale, layout.corner, device)
         self._origins = torch.as_tensor(layout.origins(heights), device=device)
