@@ -204,9 +204,8 @@ def train(options: Options, env_cfg: Any, train_cfg: Any, viewer: TrainingViewer
     if is_first:
         steps += remaining * distributed.world_size() * env.num_envs * train_cfg.runner.num_steps_per_env
         print_notes([also_note(train_cfg.evaluation, steps)])
-        if env.device == "cpu":
-            is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
-            print_notes(["" if is_short else length_note(train_cfg)])
+        is_short = options.max_iterations or options.resume or train_cfg.distillation.teachers
+        print_notes([length_note(train_cfg)] if env.device == "cpu" and not is_short else [])
         announce(runner, options, env_cfg, train_cfg, total, viewer.page)
         runner.on_checkpoint = functools.partial(viewer.show, cli.option_words(options, "task_file", "task"))
     is_complete = False

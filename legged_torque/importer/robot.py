@@ -91,11 +91,10 @@ def import_robot(file: Path, name: str = "", torque_limit: float | None = None) 
     with collect_errors(asymmetries):
         order = counterparts(joints, mirrored)
         image = Mirroring(order, mirror_signs(joints, joint_axes(source.model)[1:], order))
-        pair = image.unlike(stance.angles, joints)
-        asymmetries += [f"the nominal pose has {pair}"] if pair else []
-        sides = copy.copy(source.model)
+        pair, sides = image.unlike(stance.angles, joints), copy.copy(source.model)
         sides.jnt_range[1:], sides.jnt_limited[1:], sides.dof_armature[6:] = ranges, 1, stance.armature
-        asymmetries += filter(None, [side_problem(sides, torques, image, joints)])
+        problem = f"the nominal pose has {pair}" if pair else side_problem(sides, torques, image, joints)
+        asymmetries += [problem] if problem else []
     source.notes += [f"training without mirror images: {reason}" for reason in asymmetries]
     kinds = [next((j.removeprefix(p) for p in prefixes if j.startswith(p)), j) for j in joints]
     damped = source.model.dof_damping[6:]

@@ -145,13 +145,8 @@ def _prepare_urdf(root: ET.Element, what: str) -> list[str]:
                 raise UserError(f"{what}: '{joint.get('name')}' must be fixed or have lower < upper, not {low}, {high}")
     joints = (joint for joint in root.findall("joint") if joint.get("type") != "fixed")
     moving = {child.get("link") for joint in joints for child in joint.findall("child")}
-    masses = {link.get("name"): link.find("inertial/mass") for link in root.findall("link")}
-    return [str(link) for link, mass in masses.items() if link in moving and not _value(mass)]
-
-
-def _value(part: ET.Element | None) -> float:
-    """Return the number that an element has; 0 without one."""
-    return 0.0 if part is None else float(part.get("value", 0.0))
+    links = {link.get("name", ""): link for link in root.findall("link") if link.get("name") in moving}
+    return [name for name, link in links.items() if not any(float(mass.get("value", 0)) for mass in link.iter("mass"))]
 
 
 def _prepare(spec: mujoco.MjSpec, file: Path, is_urdf: bool) -> Notes:

@@ -56,6 +56,4 @@ class MultiHeadModel(MLPModel):
         super().__init__(
             obs, obs_groups, obs_set, output_dim, hidden_dims, activation, obs_normalization, distribution_cfg
         )
-        self.mlp = MultiHeadMLP(
-            self._get_latent_dim(), output_dim, list(hidden_dims), list(head_hidden_dims), activation
-        )
+        self.mlp = MultiHeadMLP(self._get_latent_dim(), output_dim, [*hidden_dims], [*head_hidden_dims], activation)

@@ -295,9 +295,8 @@ class NetworkModel(ModelMotor):
     def __init__(self, cfg: ModelCfg, joints: Joints) -> None:
         """Read the network; a UserError if it is of another form, or there is no target that gives its errors."""
         if not bool((joints.gains[0] > 0.0).all()):
-            raise UserError(
-                f"{joints.section} needs a control.stiffness above 0 of all joints, to have errors of targets"
-            )
+            needed = "a control.stiffness above 0 of all joints"
+            raise UserError(f"{joints.section} needs {needed}, to have errors of targets")
         super().__init__(cfg, joints)
 
 

@@ -31,9 +31,8 @@ class Sensor(Buffers):
         steps = 1.0 / (cfg.rate * state.dt) if cfg.rate else 1.0
         self.interval = round(steps)  # control steps from one measurement to the next
         if abs(steps - self.interval) > 1e-6 * steps:
-            raise UserError(
-                f"a sensor's rate must divide that of the control steps, {1 / state.dt:g} Hz, not {cfg.rate:g}"
-            )
+            of_steps = f"that of the control steps, {1 / state.dt:g} Hz"
+            raise UserError(f"a sensor's rate must divide {of_steps}, not {cfg.rate:g}")
         late = cfg.delay / state.dt
         self.delay = round(late)  # control steps
         if abs(late - self.delay) > 1e-6 * late:

@@ -76,6 +76,5 @@ def max_constraints(model: mujoco.MjModel, contacts: int) -> int:
     rows_per_contact = 2 * (int(model.geom_condim.max()) - 1)
     friction = model.nv + int((model.tendon_frictionloss > 0).sum())
     equalities = sum(_EQUALITY_ROWS.get(int(kind), 1) for kind in model.eq_type)
-    return (
-        contacts * rows_per_contact + friction + int(model.jnt_limited.sum() + model.tendon_limited.sum()) + equalities
-    )
+    limits = int(model.jnt_limited.sum() + model.tendon_limited.sum())
+    return contacts * rows_per_contact + friction + limits + equalities

@@ -122,9 +122,8 @@ class WarpEngine(Engine):
         The reference pose is not one of them: resets and inverse weights are those of the model's.
         """
         annotations = {**mjw.Model.__annotations__, "gravity": mjw.Option.__annotations__["gravity"]}
-        return [
-            name for name, kind in annotations.items() if getattr(kind, "shape", ("",))[0] == "*" and name != "qpos0"
-        ]
+        shapes = {name: getattr(kind, "shape", ("",)) for name, kind in annotations.items()}
+        return [name for name, shape in shapes.items() if shape[0] == "*" and name != "qpos0"]
 
     def _give_rows(self, name: str) -> None:
         """Replace a field that all worlds share by one with a row per world, all equal at first."""

@@ -330,9 +330,8 @@ def on_ground(qpos: np.ndarray) -> SE3:
 def ground_glb(ground: Ground) -> bytes:
     """Return a binary glTF. It has no normals, so that browsers draw flat triangles with sharp edges."""
     picture = Image.fromarray(ground.picture()[::-1])
-    material = PBRMaterial(
-        baseColorTexture=picture, baseColorFactor=GROUND_FACTOR, metallicFactor=0.0, roughnessFactor=0.95
-    )
+    look = {"baseColorFactor": GROUND_FACTOR, "metallicFactor": 0.0, "roughnessFactor": 0.95}
+    material = PBRMaterial(baseColorTexture=picture, **look)
     visual = TextureVisuals(ground.uv, material=material)
     mesh = trimesh.Trimesh(ground.vertices, ground.faces, visual=visual, process=False)
     return trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=False)

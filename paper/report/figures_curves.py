@@ -69,8 +69,7 @@ def draw_curves(experiment: Experiment, metric: str, *, scale: str = "linear", w
             runs = experiment.runs_of(task, environment)
             unfinished = [run.cell.seed for run in runs if run.cell.seed in curves and not run.is_finished(run.steps)]
             draw_curve(axis, shown, unfinished, name_of(task), color, line)
-            known = [values.dropna() for _, values in shown.items()]  # of whose last part the mean counts
-            ends = [curve[curve.index >= (1.0 - LAST_SHARE) * curve.index[-1]].mean() for curve in known]
+            ends = [end_value(values.dropna()) for _, values in shown.items()]
             place = end * (1.0 + STRIP * (1 + tasks.index(task)))
             axis.plot([place] * len(ends), ends, color=color, linestyle="none", zorder=5, **SEED_MARK)
         axis.axvline(end * (1.0 + STRIP / 2), color="#999999", linewidth=0.8)
@@ -119,6 +118,11 @@ def smoothed(curves: pd.DataFrame, window: float) -> pd.DataFrame:
     times = curves.set_axis(pd.to_timedelta(curves.index, unit="s"))  # rolling windows of a width need times
     medians = times.rolling(pd.Timedelta(window, "s"), center=True, closed="both", min_periods=1).median()
     return medians.set_axis(curves.index).where(curves.notna())
+
+
+def end_value(curve: pd.Series) -> float:
+    """Return the mean over the last :data:`LAST_SHARE` of a training."""
+    return curve[curve.index >= (1.0 - LAST_SHARE) * curve.index[-1]].mean()
 
 
 def draw_curve(axis: Axes, curves: pd.DataFrame, unfinished: list[int], label: str, color: str, line: Any) -> None:

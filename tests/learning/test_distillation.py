@@ -364,7 +364,9 @@ def test_refusals(teacher):
     config = (longer / "config.yaml").read_text()
     (longer / "config.yaml").write_text(config.replace("history_length: 1\n", "history_length: 3\n"))
     result = run_here("train.py", *SMALL, *OF_STUDENT, f"--set=distillation.teachers=[{longer}]", root=root)
-    assert_told_in_one_line(result, f"env.history_length must be at least that of the teacher '{longer}/model_1.pt', 3, not 2")
+    assert_told_in_one_line(
+        result, f"env.history_length must be at least that of the teacher '{longer}/model_1.pt', 3, not 2"
+    )
     broken = Path(shutil.copytree(root / "logs" / "a1_position" / name, root / "broken"))
     for text in ("env: 3", "env: {env: 3}"):
         (broken / "config.yaml").write_text(f"task: a1_position\n{text}\ntrain: {{}}\n")

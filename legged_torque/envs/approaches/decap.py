@@ -54,9 +54,8 @@ class DecapRobot(LeggedRobot):
         super()._init_buffers()
         self.reference = self.control.default_dof_pos.repeat(self.num_envs, 1)
         file = self.cfg.control.decap.record
-        self._record = (
-            torch.tensor(read_angles(file, self.dof_names), device=self.device) if file else self.reference[:1]
-        )
+        record = torch.tensor(read_angles(file, self.dof_names), device=self.device) if file else None
+        self._record = self.reference[:1] if record is None else record
         joints = self.symmetry.joints
         for row in self._record.cpu().numpy() if joints else ():
             pair = joints.unlike(row, self.dof_names) if joints else ""

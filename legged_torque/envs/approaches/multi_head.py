@@ -100,7 +100,5 @@ class MultiHeadTwoRatesRobot(MultiHeadRobot):
     def observation_terms(self) -> list[ObservationTerm]:
         """Return the usual ones, and how long the position actions have been held."""
         meaning = "share of the interval for which position actions have been held; 0: new ones are due"
-        return [
-            *super().observation_terms(),
-            ObservationTerm("position_phase", self.position_phase, SCALAR, meaning=meaning),
-        ]
+        phase = ObservationTerm("position_phase", self.position_phase, SCALAR, meaning=meaning)
+        return [*super().observation_terms(), phase]

@@ -48,9 +48,8 @@ class MultiHeadTwoRatesCfg(FastCfg, MultiHeadCfg):
     def set_clocks(self, policy_hz: float | None, physics_hz: float | None) -> float:
         """Set the rates; position actions are held for the same time."""
         ratio = super().set_clocks(policy_hz, physics_hz)
-        self.control.position_interval = whole_steps(
-            "control.position_interval", self.control.position_interval * ratio
-        )
+        held = self.control.position_interval * ratio
+        self.control.position_interval = whole_steps("control.position_interval", held)
         return ratio
 
 

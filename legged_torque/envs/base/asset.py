@@ -20,16 +20,8 @@ from legged_torque.envs.base.symmetry import RobotSymmetry
 from legged_torque.sim.model import FLOOR, build_model, collision_geoms, indices_matching
 from legged_torque.sim.robot_file import model_problems, spec_problems, use_plain_motors
 from legged_torque.terrain.terrain import Terrain
+from legged_torque.utils import mjcf
 from legged_torque.utils.errors import UserError, check_names, collect_errors, refuse
-from legged_torque.utils.mjcf import (
-    drawing_notes,
-    exclude_self_collisions,
-    joint_axes,
-    loading,
-    read_spec,
-    self_pairs,
-    set_joints,
-)
 
 
 @dataclass
@@ -57,7 +49,7 @@ class Asset:
 
     def dof_axes(self) -> np.ndarray:
         """Return the axes of the joints in the trunk's frame, all angles being 0. Shape: (num_dof, 3)."""
-        return joint_axes(self.mj_model)[1:]
+        return mjcf.joint_axes(self.mj_model)[1:]
 
     def symmetry(self, mirrored_legs: Sequence[Sequence[str]]) -> RobotSymmetry:
         """Return which joints and feet are mirror images of each other, given pairs of legs, right and left."""
@@ -78,13 +70,13 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     cannot simulate the robot.
     """
     settings, file = cfg.asset, resource_path(cfg.asset.file)
-    spec = read_spec(file, list(cfg.init_state.default_joint_angles))
-    problems, notes, geoms = list(spec_problems(spec)), list(drawing_notes(spec)), collision_geoms(spec)
+    spec = mjcf.read_spec(file, list(cfg.init_state.default_joint_angles))
+    problems, notes, geoms = list(spec_problems(spec)), list(mjcf.drawing_notes(spec)), collision_geoms(spec)
     chosen: list[list[int]] = []
     for parts in ([settings.foot_name], settings.penalize_contacts_on, settings.terminate_after_contacts_on):
         with collect_errors(problems):
             chosen.append(indices_matching(geoms, parts))
-    with loading(file):
+    with mjcf.loading(file):
         if terrain and not problems:
             terrain.add_to(spec, FLOOR)
         model = spec.compile() if problems else build_model(spec, geoms)
@@ -97,10 +89,10 @@ def load_asset(cfg: LeggedRobotCfg, terrain: Terrain | None = None) -> Asset:
     refuse(problems, f"'{settings.file}' cannot be simulated")
     use_plain_motors(spec, model)
     _choose_self_collisions(settings, spec, model, notes)
-    with loading(file):
+    with mjcf.loading(file):
         model = spec.compile()
     motors: Any = cfg.motors
-    set_joints(model, motors.of_joints(dof_names))
+    mjcf.set_joints(model, motors.of_joints(dof_names))
     model.opt.timestep = cfg.sim.dt
     feet, penalized, terminating = chosen
     notes += foot_notes(model, [geoms[place] for place in feet])
@@ -114,13 +106,13 @@ def _choose_self_collisions(
 
     A UserError if contacts were asked for and the file has none.
     """
-    pairs = len(self_pairs(model))
+    pairs = len(mjcf.self_pairs(model))
     if settings.self_collisions and not pairs:
         why = "no two geoms of its moving parts have contype and conaffinity that match, or are a <pair>"
         raise UserError(f"asset.self_collisions is on, but in '{settings.file}' {why}")
     if pairs and not settings.self_collisions:
         notes.append(f"{pairs} pairs of parts that could collide do not; asset.self_collisions=True lets them")
-        exclude_self_collisions(spec, model)
+        mjcf.exclude_self_collisions(spec, model)
 
 
 def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[float]:
@@ -134,8 +126,6 @@ def nominal_pose(angles: dict[str, float], dof_names: Sequence[str]) -> list[flo
         if name not in angles:
             raise UserError(f"{key} lacks the joint '{name}'")
     if list(angles) != list(dof_names):
-        why = "in which policies see and drive them"
-        raise UserError(
-            f"the MJCF's joints cannot be put in the order of {key}, {why}, by moving limbs: {', '.join(dof_names)}"
-        )
+        order = f"the order of {key}, in which policies see and drive them"
+        raise UserError(f"the MJCF's joints cannot be put in {order}, by moving limbs: {', '.join(dof_names)}")
     return list(angles.values())

@@ -89,8 +89,7 @@ class WalkingMetrics:
 
     def estimates(self) -> dict[str, metrics.Estimate]:
         """Return the metrics with standard errors."""
-        sums = self._sums.double().cpu().numpy()
-        return metrics.estimates(self._ratios(sums))
+        return metrics.estimates(self._ratios(self._sums.double().cpu().numpy()))
 
     def _ratios(self, sums: Any) -> dict[str, tuple[Any, Any]]:
         """Return the ratios of sums, which are a tensor or an array."""
@@ -103,16 +102,14 @@ class CommandBreakdown:
     def __init__(self, task: WalkingTask) -> None:
         """Start with empty sums."""
         self._task = task
-        ranges = task.cfg.commands.allowed()
-        self._ranges = torch.tensor([ranges[name] for name in COMMANDS], device=task.device)
+        self._ranges = torch.tensor([task.cfg.commands.allowed()[name] for name in COMMANDS], device=task.device)
         shape = (task.num_envs, len(COMMANDS), NUM_BINS + 1)  # the last: commands of 0 outside of the range
         self._sums = torch.zeros(4, *shape, device=task.device)
 
     def add_step(self, commands: Tensor) -> None:
         """Add the step that the task has just made; arguments as for :meth:`WalkingMetrics.add_step`."""
         task = self._task
-        velocity = task.state.planar_velocity()
-        error = (commands - velocity).abs()
+        error = (commands - task.state.planar_velocity()).abs()
         tracked = num_tracked(task)
         tracking = torch.stack(metrics.tracking_percentage(torch, error[:, :tracked], commands[:, :tracked]))
         low, high = self._ranges.T

@@ -266,9 +266,8 @@ def _check(term: ObservationTerm, values: Tensor, num_envs: int, before: dict[st
     size = math.prod(values.shape[1:])
     scales, mirrored = len(_per_value(term.scale, size)), len(term.mirror.order) if term.mirror else size
     if (scales, mirrored) != (size, size):
-        raise UserError(
-            f"observation '{term.name}' has {size} values, {scales} scales and {mirrored} in its mirror image"
-        )
+        others = f"{scales} scales and {mirrored} in its mirror image"
+        raise UserError(f"observation '{term.name}' has {size} values, {others}")
 
 
 def _per_value(value: float | Sequence[float], size: int) -> list[float]:

@@ -113,8 +113,7 @@ def robot_parameters(
 def _mirror_images_of_vectors(model: mujoco.MjModel, geoms: Sequence[int], of_geoms: Mirroring) -> Mirroring | None:
     """Return the mirroring of a vector per geom, in its body's frame; None unless axes are images of axes."""
     frames = zero_pose(model).xmat[model.geom_bodyid[geoms]].reshape(-1, 3, 3)
-    order: list[int] = []
-    signs: list[float] = []
+    order, signs = list[int](), list[float]()
     for frame, other in zip(frames, of_geoms.order, strict=True):
         image = frame.T @ np.diag(VECTOR.signs) @ frames[other]
         if np.abs(image - image.round()).max() > MIRROR_TOLERANCE:

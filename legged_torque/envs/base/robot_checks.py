@@ -65,28 +65,18 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
 
 
 def side_problem(model: mujoco.MjModel, torques: np.ndarray, joints: Mirroring, names: Sequence[str]) -> str:
-    """Return which joint is not what the mirror image of its counterpart is; empty if all are.
-
-    Args:
-        model: The robot.
-        torques: Highest torques [N m]. Shape: (num_dof,).
-        joints: Mirroring of joint angles.
-        names: Those of the joints.
-    """
+    """Return what of a joint, ``torques`` [N m] too, is not the mirror image of its counterpart's; empty if all is."""
     order, signs = list(joints.order), np.array(joints.signs)
     limits = np.clip(joint_limits(model)[1:], -_ENDLESS, _ENDLESS)
     turned = np.where(signs[:, np.newaxis] > 0.0, limits[order], -limits[order, ::-1])
     parts: list[tuple[str, np.ndarray, np.ndarray, Any]] = [("ranges", limits, turned, 1.0)]
     own = {"torque limits": torques, "damping": FAST * model.dof_damping[6:]}
     own |= {"dry friction": model.dof_frictionloss[6:], "springs": model.jnt_stiffness[1:]}
-    for what, values in own.items():
-        parts.append((what, values, values[order], np.maximum(torques, torques[order])))
-    rng = np.random.default_rng(0)
-    for _ in range(_POSES):
-        angles = rng.uniform(*np.clip(limits.T, -1.0, 1.0))
-        inertia, image = (
-            mass_matrix(model, zero_pose(model, pose))[6:, 6:] for pose in (angles, angles[order] * signs)
-        )
+    parts += [(what, values, values[order], np.maximum(torques, torques[order])) for what, values in own.items()]
+    low, high = np.clip(limits.T, -1.0, 1.0)
+    for angles in np.random.default_rng(0).uniform(low, high, (_POSES, len(order))):
+        both = (zero_pose(model, pose) for pose in (angles, angles[order] * signs))
+        inertia, image = (mass_matrix(model, data)[6:, 6:] for data in both)
         about = np.sqrt(np.diag(inertia))
         parts.append(
             ("inertias", inertia, image[np.ix_(order, order)] * np.outer(signs, signs), np.outer(about, about))
@@ -99,7 +89,7 @@ def side_problem(model: mujoco.MjModel, torques: np.ndarray, joints: Mirroring, 
     return ""
 
 
-def control_problem(joints: Mirroring | None, dof_names: Sequence[str], control: ControlParameters, motors: Any) -> str:
+def control_problem(joints: Mirroring | None, names: Sequence[str], control: ControlParameters, motors: Any) -> str:
     """Return which nominal angle or gain does not fit its counterpart; empty if all do, or joints have no images."""
     if joints is None:
         return ""
@@ -107,10 +97,10 @@ def control_problem(joints: Mirroring | None, dof_names: Sequence[str], control:
     checks["control.stiffness"] = joints.unsigned(), control.p_gains[0].cpu().numpy()
     checks["control.damping"] = joints.unsigned(), control.d_gains[0].cpu().numpy()
     for link, cfg in vars(motors).items():
-        for name, gains in cfg.constants(dof_names, link).items() if getattr(cfg, "_of_law", False) else ():
-            checks[f"motors.{link}.{name}"] = joints.unsigned(), np.array(gains)
+        for gain, gains in cfg.constants(names, link).items() if getattr(cfg, "_of_law", False) else ():
+            checks[f"motors.{link}.{gain}"] = joints.unsigned(), np.array(gains)
     for setting, (image, values) in checks.items():
-        if pair := image.unlike(values, dof_names):
+        if pair := image.unlike(values, names):
             return f"{setting} has {pair}: {UNLIKE}"
     return ""
 

@@ -36,10 +36,8 @@ def check_env_cfg(cfg: LeggedRobotCfg) -> None:
     for path, delay in delays(cfg).items():
         is_in_steps = (delay.range[1] or delay.jitter) and delay.unit != "control_steps"
         if is_in_steps and path.removeprefix("motors.") in cfg.motors.chain and not cfg.control.refresh_torques:
-            raise UserError(
-                f"{path}.unit must be control_steps, since control.refresh_torques is off: torques are computed once "
-                "per control step"
-            )
+            why = "control.refresh_torques is off: torques are computed once per control step"
+            raise UserError(f"{path}.unit must be control_steps, since {why}")
 
 
 def _check_engine(cfg: LeggedRobotCfg) -> None:

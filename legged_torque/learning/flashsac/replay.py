@@ -84,10 +84,8 @@ class Replay:
         assert transition.next_obs is not None
         dones, time_outs = transition.dones, transition.time_outs
         timed_out = torch.zeros_like(dones) if time_outs is None else dones & time_outs
-        step = {
-            group: torch.where(self._timed_out.unsqueeze(1), self._final[group], transition.obs[group])
-            for group in self._sizes
-        }
+        is_late = self._timed_out.unsqueeze(1)
+        step = {name: torch.where(is_late, self._final[name], transition.obs[name]) for name in self._sizes}
         step |= {"_actions": actions, "_rewards": transition.rewards, "_is_step": ~self._timed_out}
         step |= {"_fell": dones & ~timed_out, "_ended": dones}
         row = (self.count % self.rows).unsqueeze(0)
