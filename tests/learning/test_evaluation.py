@@ -173,6 +173,7 @@ def test_curricula_are_those_of_the_training(make_runner, noted):
 def test_random_numbers_of_its_own(make_runner, noted):
     """Its worlds depend on its seed alone, do not begin in step, and the next evaluation draws other numbers."""
     task = make_runner(env={"commands.resampling_probability": 1.0}).env
+    noted.clear()  # of the step that a training tries
     settings = {"num_envs": 4, "num_samples": 8, "perturbation": ""}
     for seed in (7, 7, 8):
         evaluating = TrainingEvaluator(task, lambda obs: torch.zeros(len(obs), 12), settings, seed)
