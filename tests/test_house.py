@@ -25,7 +25,7 @@ MAX_LINES = 400  # of a file
 LINES = {
     "legged_torque/benchmark": 193,
     "legged_torque/deploy": 1554,
-    "legged_torque/envs": 5544,
+    "legged_torque/envs": 5543,
     "legged_torque/experiments": 1124,
     "legged_torque/identification": 459,
     "legged_torque/importer": 1295,
@@ -33,7 +33,7 @@ LINES = {
     "legged_torque/motors": 1557,
     "legged_torque/runtime": 2192,
     "legged_torque/sensors": 321,
-    "legged_torque/sim": 5951,
+    "legged_torque/sim": 5952,
     "legged_torque/terrain": 574,
     "legged_torque/utils": 3575,
     "legged_torque/viewer": 2494,

@@ -89,7 +89,7 @@ class Randomization:
         rows: list[kernels.RandomNumber] = []
         at_start: list[float] = []
         first_draw: dict[str, int] = {}
-        owners: dict[int, str] = {}  # of the numbers, by address
+        owners: dict[tuple[str | int, int], str] = {}  # who draws a number, by its field and place
         num_draws = 1  # number 0 decides what is kept
         for parameter in parameters:
             check_value(f"random parameter '{parameter.name}'", parameter.draw, Draw)
@@ -109,8 +109,9 @@ class Randomization:
             table_rows = table(parameter, field, keep_probability)
             for i, (column, row) in enumerate(zip(parameter.columns, table_rows, strict=True)):
                 row.address = field[:, column].data_ptr()
-                if owners.setdefault(row.address, parameter.name) != parameter.name:
-                    both = f"'{owners[row.address]}' and '{parameter.name}'"
+                number = (parameter.field if isinstance(parameter.field, str) else field.data_ptr(), column)
+                if (owner := owners.setdefault(number, parameter.name)) != parameter.name:
+                    both = f"'{owner}' and '{parameter.name}'"
                     raise UserError(f"random parameters {both} write the same number: leave one of them out")
                 row.stride = field.stride(0) * field.element_size()
                 row.draw = start + (0 if parameter.shared else i)

@@ -17,7 +17,6 @@ UNLIKE = "these are not mirror images of each other"
 SIDES = 0.1  # by which sides may differ: ranges [rad], shares of torques and inertias
 FAST = 10.0  # velocity at which damping is compared with torques [rad/s]
 _POSES = 5  # random ones that are mirrored
-_ENDLESS = 1e3  # range of joints without one [rad]
 
 
 def pose_problems(pose: Sequence[float], model: mujoco.MjModel) -> Iterator[str]:
@@ -67,7 +66,7 @@ def mirror_problem(model: mujoco.MjModel, joints: Mirroring, feet: Mirroring, fo
 def side_problem(model: mujoco.MjModel, torques: np.ndarray, joints: Mirroring, names: Sequence[str]) -> str:
     """Return what of a joint, ``torques`` [N m] too, is not the mirror image of its counterpart's; empty if all is."""
     order, signs = list(joints.order), np.array(joints.signs)
-    limits = np.clip(joint_limits(model)[1:], -_ENDLESS, _ENDLESS)
+    limits = np.clip(joint_limits(model)[1:], -1e3, 1e3)  # [rad]; without a range they are endless
     turned = np.where(signs[:, np.newaxis] > 0.0, limits[order], -limits[order, ::-1])
     parts: list[tuple[str, np.ndarray, np.ndarray, Any]] = [("ranges", limits, turned, 1.0)]
     own = {"torque limits": torques, "damping": FAST * model.dof_damping[6:]}
