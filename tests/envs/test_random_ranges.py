@@ -130,9 +130,12 @@ def test_no_factors_per_joint(make_task, name):
 
 def test_hard_ranges_of_a_variant():
     """They replace ranges of another operation that the variant has, as a value can only be set or changed."""
-    cfg = A1Cfg()
-    cfg.domain_rand.ground_friction = {"scale": [0.8, 1.2]}
-    hard = cfg.parameter_ranges()["hard"]["domain_rand"]["ground_friction"]
+
+    class Variant(A1Cfg):
+        class domain_rand:
+            ground_friction = {"scale": [0.8, 1.2]}
+
+    hard = Variant().parameter_ranges()["hard"]["domain_rand"]["ground_friction"]
     assert hard == {"set": [0.001, 2.0]}
 
 
