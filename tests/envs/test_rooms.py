@@ -89,7 +89,7 @@ def test_observation_terms_that_do_not_fit(term, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"value": torch.ones(2, 1)}, "value must be a function, as lambda: ..., not tensor"),
+        ({"value": torch.ones(2, 1)}, "value must be a function, as lambda: ..., not Tensor"),
         ({"scale": math.nan}, "scale must be finite"),
         ({"scale": ["a"]}, "scale must be a number, not ['a']"),
         ({"noise": [0.1, 0.2]}, "noise must be a number, not [0.1, 0.2]"),

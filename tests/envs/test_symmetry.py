@@ -116,10 +116,13 @@ UNLIKE = {
 @pytest.mark.parametrize("change", UNLIKE)
 def test_settings_of_one_side(change):
     """A pose or gains that differ between left and right leave no mirror image: the same action is other torques."""
-    cfg, _ = get_cfgs("--num_envs=1", f"--set={change}", task="a1_position")
+    words = ("--num_envs=1", f"--set={change}")
+    cfg, _ = get_cfgs(*words, "--set=motors.chain=[delay, drive, ideal]", task="a1_position")
     message = error_of(lambda: LeggedRobot(cfg).mirror)
     assert "has {} for 'FR_hip_joint' and {} for 'FL_hip_joint'".format(*UNLIKE[change]) in message
     assert message.startswith(change[:14]) and "symmetry_cfg.use_data_augmentation=false" in message
+    if "drive" in change:  # which counts in the chain alone
+        assert LeggedRobot(get_cfgs(*words, task="a1_position")[0]).mirror
 
 
 def test_offsets_to_one_side(make_task):

@@ -56,10 +56,9 @@ class DecapRobot(LeggedRobot):
         file = self.cfg.control.decap.record
         record = torch.tensor(read_angles(file, self.dof_names), device=self.device) if file else None
         self._record = self.reference[:1] if record is None else record
-        joints = self.symmetry.joints
-        for row in self._record.cpu().numpy() if joints else ():
-            pair = joints.unlike(row, self.dof_names) if joints else ""
-            self.symmetry.refuse(f"a row of control.decap.record has {pair}: {UNLIKE}" if pair else "")
+        if joints := self.symmetry.joints:
+            for pair in filter(None, (joints.unlike(row, self.dof_names) for row in self._record.cpu().numpy())):
+                self.symmetry.refuse(f"a row of control.decap.record has {pair}: {UNLIKE}")
         self.bias = torch.ones(1, device=self.device)
         self.update_curriculum()
 

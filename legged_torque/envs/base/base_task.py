@@ -134,7 +134,7 @@ class BaseTask(InPlace, VecEnv):
         self.step_graph.reset()
 
     def try_step(self) -> None:
-        """Make a control step and undo it: trainings find mistakes in a user's code before they make a folder.
+        """Update curricula, make a step, undo it: trainings find mistakes in a user's code before they make a folder.
 
         Tensors of the task, what its worlds keep, and random numbers are afterwards as before.
         """

@@ -41,9 +41,9 @@ class ObservationTerm:
 
     def __post_init__(self) -> None:
         """Raise a UserError if value is no function, or scale or noise are no numbers."""
+        scale, kind = self.scale, type(self.value).__name__
         if not callable(self.value):
-            raise UserError(f"observation '{self.name}': value must be a function, as lambda: ..., not {self.value}")
-        scale: Any = self.scale
+            raise UserError(f"observation '{self.name}': value must be a function, as lambda: ..., not {kind}")
         scale = scale.tolist() if hasattr(scale, "tolist") else list(scale) if isinstance(scale, Sequence) else scale
         self.scale = check_value(f"observation '{self.name}': scale", scale, float | list[float])
         self.noise = check_value(f"observation '{self.name}': noise", self.noise, NotNegative)

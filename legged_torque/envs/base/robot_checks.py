@@ -95,9 +95,10 @@ def control_problem(joints: Mirroring | None, names: Sequence[str], control: Con
     checks = {"init_state.default_joint_angles": (joints, control.default_dof_pos.cpu().numpy())}
     checks["control.stiffness"] = joints.unsigned(), control.p_gains[0].cpu().numpy()
     checks["control.damping"] = joints.unsigned(), control.d_gains[0].cpu().numpy()
-    for link, cfg in vars(motors).items():
-        for gain, gains in cfg.constants(names, link).items() if getattr(cfg, "_of_law", False) else ():
-            checks[f"motors.{link}.{gain}"] = joints.unsigned(), np.array(gains)
+    links: dict[str, Any] = {f"motors.{link}": getattr(motors, link, None) for link in motors.chain}
+    for path, cfg in links.items():
+        for gain, gains in cfg.constants(names, path).items() if getattr(cfg, "_of_law", False) else ():
+            checks[f"{path}.{gain}"] = joints.unsigned(), np.array(gains)
     for setting, (image, values) in checks.items():
         if pair := image.unlike(values, names):
             return f"{setting} has {pair}: {UNLIKE}"
